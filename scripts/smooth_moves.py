@@ -64,7 +64,7 @@ def find_range(found: IdentifiedServo, tolerance_rad: float) -> ServoRange | Non
     It does not if the steps were too small to show the slew limit, if the delay is uncertain by more than a sample,
     if the model leaves a residual beyond the noise, or if the noise of every run could hide one beyond the reserve.
     """
-    noise_rad = min(segment.noise_rad for segment in found.trace.segments)
+    noise_rad = min(run.noise for run in found.trace.runs)
     is_noisy = noise_rad * sqrt(MISFIT_MAX**2 - 1.0) > RESERVE * tolerance_rad
     frequency, damping, _, delay_s = find_half_widths((found, found), found.servo)
     if is_noisy or delay_s > SAMPLE_S or not found.slew_identified or found.misfit > MISFIT_MAX:

@@ -18,7 +18,7 @@ from optodrive.cli.options import (
 )
 from optodrive.cli.output import announce_compilation, list_written, print_answer, show_progress
 from optodrive.cli.push_options import add_push_options
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, list_names
 from optodrive.core.types.push_options import PushOptions
 
 if TYPE_CHECKING:
@@ -96,9 +96,7 @@ def _format_feasibility(report: "FeasibilityReport") -> list[str]:
 
 
 def _format_pixels(pixels: Sequence[int]) -> str:
-    listed = ", ".join(map(str, pixels[:PIXELS_LISTED_MAX]))
-    more = len(pixels) - PIXELS_LISTED_MAX
-    return f"pixel{'s' if len(pixels) > 1 else ''} {listed}{f' and {more} more' if more > 0 else ''}"
+    return f"pixel{'s' if len(pixels) > 1 else ''} {list_names(pixels, PIXELS_LISTED_MAX)}"
 
 
 def _format_shortfall(shortfall: "ShortfallSummary") -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from optodrive.cli.service_program import check_program
-from optodrive.core.errors import InputError, RefusedError
+from optodrive.core.errors import InputError, RefusedError, refuse_os_error
 from optodrive.core.files import lock_folder, read_regular_file, write_text
 from optodrive.core.toml_model import parse_toml
 from optodrive.device.config import Config
@@ -344,10 +344,8 @@ class Installation:
             if status == "edited":
                 actions.append((path, "edited, kept"))
                 continue
-            try:
+            with refuse_os_error(self.resolve(path), "a file that can be removed"):
                 self.resolve(path).unlink(missing_ok=True)
-            except OSError as error:
-                raise InputError(str(self.resolve(path)), error.strerror, "a file that can be removed") from None
             del self._digests[str(path)]
             actions.append((path, "removed" if status == "as installed" else "was missing"))
         self._save_digests()
@@ -394,9 +392,5 @@ def _read_text(path: Path) -> str:
 
 
 def _make_folder(folder: Path) -> None:
-    try:
+    with refuse_os_error(folder, "a folder that can be created (as root, or with --root)"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            str(folder), error.strerror, "a folder that can be created (as root, or with --root)"
-        ) from None

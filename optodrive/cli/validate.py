@@ -31,13 +31,11 @@ def validate(
     if diagnose and model is not None:
         raise InputError("--model", str(model), "--diagnose or --model, not both: --diagnose starts from Text S1")
     if diagnose:
-        from optodrive.cli.validate import diagnose_paper_facts as tell
-
-        tell(json)
+        diagnose_paper_facts(json)
         return
-    from optodrive.cli.validation_table import print_validation as print_table
+    from optodrive.cli.validation_table import print_validation
 
-    print_table(json, None if model is None else check_model_path(model))
+    print_validation(json, None if model is None else check_model_path(model))
 
 
 LITERAL_SET = "paper_s1_literal"

@@ -1,11 +1,11 @@
 """Comparison of the paper's facts with the parameter sets: rows, terminal table, JSON."""
 
-from dataclasses import asdict, dataclass
-from math import isfinite
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from optodrive.cli.output import print_json
+from optodrive.core.document import to_json
 from optodrive.lab.validation.outcomes import (
     DERIVED_FROM_FITTED,
     EXTENDED_DERIVED_FROM_FITTED,
@@ -18,7 +18,7 @@ from optodrive.lab.validation.outcomes import (
     simulate_outcomes,
 )
 from optodrive.physics.paper_facts import PaperFact, load_paper_facts
-from optodrive.physics.parameters import load_parameters
+from optodrive.physics.parameters import ParameterSet, load_parameters
 
 NOTABLE_ERROR = 0.15
 """Relative error of the calibrated set above which a remark is shown."""
@@ -62,35 +62,29 @@ def build_validation_rows(user_file: Path | None = None) -> list[ValidationRow]:
 
     `user_file` is a further parameter set to compare. Raises InputError for a file that cannot be used.
     """
-    literal, calibrated = load_parameters("paper_s1_literal"), load_parameters("calibrated")
-    extended_outcomes = simulate_outcomes(load_parameters("extended"))
     user_parameters = None if user_file is None else load_parameters(user_file)
-    user_outcomes = {} if user_parameters is None else simulate_outcomes(user_parameters)
-    models = INPUTS | OUTCOMES
+    literal, calibrated = (_predict(load_parameters(name)) for name in ("paper_s1_literal", "calibrated"))
+    extended = _predict(load_parameters("extended"), is_simulated=True)
+    own = None if user_parameters is None else _predict(user_parameters, is_simulated=True)
     rows = []
     for name, fact in load_paper_facts().items():
-        if name in models:
-            literal_value, calibrated_value = models[name](literal), models[name](calibrated)
-            remark = REMARKS[name] if fact.is_contradicted(calibrated_value, NOTABLE_ERROR) else ""
-            extended = extended_outcomes.get(name, calibrated_value)
-            value = None if user_parameters is None else user_outcomes.get(name, models[name](user_parameters))
+        if name in literal:
+            values = literal[name], calibrated[name], extended[name], None if own is None else own[name]
+            ratios = [None if value is None else fact.ratio(value) for value in values]
+            remark = REMARKS[name] if fact.is_contradicted(calibrated[name], NOTABLE_ERROR) else ""
+            role = _find_role(name, {*FITTED_ON.values()} | DERIVED_FROM_FITTED)
+            extended_role = _find_role(name, {*EXTENDED_FITTED_ON.values()} | EXTENDED_DERIVED_FROM_FITTED)
+            nominal = values[0], ratios[0], values[1], ratios[1], role
             rows.append(
-                ValidationRow(
-                    fact=fact,
-                    literal=literal_value,
-                    literal_ratio=fact.ratio(literal_value),
-                    calibrated=calibrated_value,
-                    calibrated_ratio=fact.ratio(calibrated_value),
-                    role=_find_role(name, {*FITTED_ON.values()} | DERIVED_FROM_FITTED),
-                    extended=extended,
-                    extended_ratio=fact.ratio(extended),
-                    extended_role=_find_role(name, {*EXTENDED_FITTED_ON.values()} | EXTENDED_DERIVED_FROM_FITTED),
-                    remark=remark,
-                    model=value,
-                    model_ratio=None if value is None else fact.ratio(value),
-                )
+                ValidationRow(fact, *nominal, values[2], ratios[2], extended_role, remark, values[3], ratios[3])
             )
     return rows
+
+
+def _predict(parameters: ParameterSet, is_simulated: bool = False) -> dict[str, float]:
+    """Return inputs and outcomes by fact, in closed form or simulated with the set's terms."""
+    outcomes = {name: model(parameters) for name, model in (INPUTS | OUTCOMES).items()}
+    return outcomes | (simulate_outcomes(parameters) if is_simulated else {})
 
 
 def _find_role(name: str, fitted_facts: set[str]) -> Role:
@@ -110,14 +104,10 @@ def print_validation(json: bool = False, model: Path | None = None) -> None:
 
 def build_document(rows: list[ValidationRow]) -> dict[str, Any]:
     """Return the rows as JSON data in SI units. Numbers that are not finite become null."""
-    facts = [asdict(row.fact) | _to_plain(row) for row in rows]
+    stated = [to_json(row) for row in rows]
+    facts = [each.pop("fact") | each for each in stated]
     fitted = {"fitted_on": dict(FITTED_ON), "extended_fitted_on": dict(EXTENDED_FITTED_ON)}
     return {"facts": facts, "not_modelled": dict(NOT_MODELLED)} | fitted
-
-
-def _to_plain(row: ValidationRow) -> dict[str, Any]:
-    plain = {key: value for key, value in vars(row).items() if key != "fact"}
-    return {key: None if isinstance(value, float) and not isfinite(value) else value for key, value in plain.items()}
 
 
 def format_cells(row: ValidationRow) -> list[str]:
@@ -126,23 +116,14 @@ def format_cells(row: ValidationRow) -> list[str]:
     measured = ("< " if row.fact.relation == "<" else "") + f"{row.fact.value * scale:.4g}"
     if row.fact.uncertainty is not None:
         measured += f" ± {row.fact.uncertainty * scale:.2g}"
-    return [
-        row.fact.id,
-        measured + ("" if unit == "1" else f" {unit}"),
-        f"{row.literal * scale:.3g}",
-        _format_ratio(row.literal_ratio),
-        f"{row.calibrated * scale:.3g}",
-        _format_ratio(row.calibrated_ratio),
-        row.role,
-        f"{row.extended * scale:.3g}",
-        _format_ratio(row.extended_ratio),
-        row.extended_role,
-        *([] if row.model is None else [f"{row.model * scale:.3g}", _format_ratio(row.model_ratio)]),
-    ]
 
+    def format_pair(value: float, ratio: float | None) -> tuple[str, str]:
+        return f"{value * scale:.3g}", "" if ratio is None else f"{ratio:.2f}"
 
-def _format_ratio(ratio: float | None) -> str:
-    return "" if ratio is None else f"{ratio:.2f}"
+    cells = [row.fact.id, measured + ("" if unit == "1" else f" {unit}")]
+    cells += [*format_pair(row.literal, row.literal_ratio), *format_pair(row.calibrated, row.calibrated_ratio)]
+    cells += [row.role, *format_pair(row.extended, row.extended_ratio), row.extended_role]
+    return cells + ([] if row.model is None else [*format_pair(row.model, row.model_ratio)])
 
 
 def _print_table(rows: list[ValidationRow]) -> None:

@@ -1,6 +1,7 @@
 """Errors by origin: the caller's input, the plan, the board, the link."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 MESSAGE_MAX = 1000
@@ -43,6 +44,15 @@ class InputError(OptodriveError):
         found = shown if shown == repr(MISSING) else f"got {shown}"
         message = escape_unprintable(f"{where}: {found}, expected {expected}")
         super().__init__(message if len(message) <= MESSAGE_MAX else message[: MESSAGE_MAX - 1] + "…")
+
+
+@contextmanager
+def refuse_os_error(place: object, expected: str) -> Iterator[None]:
+    """Convert an OSError of the block into an InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(str(place), error.strerror or str(error), expected) from None
 
 
 class DivergedError(InputError):

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.errors import InputError, Unquoted, refuse_os_error
 
 REQUEST_BYTES_MAX = 64_000_000
 """Largest file of frames or of a picture, bytes: that of a daemon's largest request body."""
@@ -99,19 +99,15 @@ def _require_new(option: str, path: Path) -> None:
 
 def create_folder(path: Path) -> None:
     """Create a folder and its parents unless it exists. Raise InputError with the path if it cannot be created."""
-    try:
+    with refuse_os_error(path, "a folder that can be created"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a folder that can be created") from None
 
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
     """Let one process at a time change the files of a folder. Raise InputError for one that cannot be opened."""
-    try:
+    with refuse_os_error(folder, "an existing folder"):
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    except OSError as error:
-        raise InputError(str(folder), error.strerror or str(error), "an existing folder") from None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -133,11 +129,8 @@ def read_regular_file(path: Path, bytes_max: int, *, private: bool = False) -> b
 
 def read_bounded(path: Path, bytes_max: int = REQUEST_BYTES_MAX) -> bytes:
     """Return the content of a file of bounded size, for which a caller may wait: a pipe, too. Raise InputError."""
-    try:
-        with path.open("rb") as file:
-            content = file.read(bytes_max + 1)
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
+    with refuse_os_error(path, "a readable file"), path.open("rb") as file:
+        content = file.read(bytes_max + 1)
     if len(content) > bytes_max:
         raise InputError(str(path), Unquoted("a larger file"), f"at most {bytes_max} bytes")
     return content

@@ -1,9 +1,10 @@
-"""Text of a quantity, with digits, SI prefix and unit, and conversions of units for interfaces.
+"""Text of a quantity, with digits, SI prefix and unit, and of a list, and conversions of units for interfaces.
 
 Internally all quantities are in SI units. The expected value of an input field stays in the unit of the field, as the
 user types it.
 """
 
+from collections.abc import Sequence
 from math import floor, isfinite, log10
 from typing import TYPE_CHECKING, TypeVar
 
@@ -34,6 +35,8 @@ LARGE_PREFIX_UNITS = ("Hz",)
 """Leading units that take the prefixes k and M."""
 MIN_PLAIN, MAX_PLAIN = 1e-4, 1e7
 """Magnitudes between which a number without prefix is written without a power of ten."""
+MAX_NAMES = 4
+"""Names that a list shows."""
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -62,6 +65,12 @@ def format_number(value: float, digits: int = 3) -> str:
 def format_range(low: float, high: float, unit: str, digits: int = 3) -> str:
     """Return a range with its unit: "1 µm to 3 mm"."""
     return f"{format_quantity(low, unit, digits)} to {format_quantity(high, unit, digits)}"
+
+
+def list_names(names: Sequence[object], max_names: int = MAX_NAMES) -> str:
+    """Return names as text, the first ones of many."""
+    shown = ", ".join(map(str, names[:max_names]))
+    return shown if len(names) <= max_names else f"{shown} and {len(names) - max_names} more"
 
 
 def select_scale(magnitude: float, unit: str) -> tuple[float, str]:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, refuse_os_error
 from optodrive.core.files import lock_folder
 
 SOCKET_PATH_MAX_BYTES = 100
@@ -81,15 +81,13 @@ def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
     lookup_path = _build_lookup_path(port)
     if unix is not None and len(os.fsencode(find_link_socket(None, unix))) > SOCKET_PATH_MAX_BYTES:
         raise InputError("daemon.socket", str(unix), "a shorter path, because the link's socket lies beside it")
-    try:
+    with refuse_os_error(lookup_path, "a folder that can be created"):
         lookup_path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         with lock_folder(lookup_path.parent):  # no other daemon is between creation and lock of its own folder
             path, lock = _create_folder(lookup_path)
             _remove_unused(lookup_path)
         if unix is not None:  # a command that knows only the TCP port finds it here
             (path / "link.sock").symlink_to(find_link_socket(None, unix.absolute()))
-    except OSError as error:
-        raise InputError(str(lookup_path), error.strerror, "a folder that can be created") from None
     if unix is None:
         return RuntimeFolder(path, path / "link.sock", LINK_MODE, lookup_path, lock)
     return RuntimeFolder(path, find_link_socket(None, unix), SHARED_LINK_MODE, lookup_path, lock)

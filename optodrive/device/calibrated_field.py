@@ -18,7 +18,7 @@ from pydantic import Field as Item
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, ReadOnlyArrays
 from optodrive.device.config_sections import DIRECT_WIRING, FocalLength, Wiring
 from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, GEOMETRY_RANGES, FieldGeometry, beam_position_m
 
@@ -97,7 +97,7 @@ GUESS_MARGIN = 1.1
 
 
 @dataclass(frozen=True, eq=False)
-class CalibratedField:
+class CalibratedField(ReadOnlyArrays):
     """Map from codes to display positions: physical geometry plus a smooth surface. Arrays are read-only.
 
     surface_m: [2, TERM_COUNT] coefficients of x and y; rad_per_code, focal_length_m, wiring: of the configuration that
@@ -113,9 +113,6 @@ class CalibratedField:
     sigma_grid_m: FloatArray
     display: str = ""
     wiring: Wiring = DIRECT_WIRING
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @cached_property
     def is_finite(self) -> bool:

@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from optodrive.core.errors import MISSING, InputError, Unquoted
 from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import ConflictError, Name, Section
-from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from optodrive.device.config_sections import (
     CLOCKED_DACS,
     DAC_HALF_RANGE_CODES,
@@ -305,16 +305,13 @@ class Config(Section):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PixelLayout:
+class PixelLayout(ReadOnlyArrays):
     """Pixel positions [p], m, from the optical axis, x to the right, y up. Indices count by rows from the bottom."""
 
     x_m: FloatArray
     y_m: FloatArray
     row: IntArray
     column: IntArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.x_m)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.types.arrays import IntArray, freeze_arrays
+from optodrive.core.types.arrays import IntArray, ReadOnlyArrays
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_sections import DisplaySection
 
@@ -41,7 +41,7 @@ def complete_panel(config: Config) -> Panel:
 
 
 @dataclass(frozen=True, eq=False)
-class Neighbours:
+class Neighbours(ReadOnlyArrays):
     """Pixels that share an edge with each pixel.
 
     indices: [p, 4] left, right, below and above, −1 for none; frame_edges: [p] number of edges on the frame, at the rim
@@ -50,9 +50,6 @@ class Neighbours:
 
     indices: IntArray
     frame_edges: IntArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.frame_edges)

@@ -12,7 +12,7 @@ from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.files import write_text
 from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
-from optodrive.core.types.arrays import BoolArray, FloatArray, StrArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, ReadOnlyArrays, StrArray
 from optodrive.device.config import Config, PixelLayout, build_pixel_layout
 from optodrive.device.config_sections import DisplaySection, Pitch
 
@@ -88,7 +88,7 @@ NUMERIC_FIELDS = ("gain", "gain_sigma", "offset_x_m", "offset_y_m", "offset_x_si
 
 
 @dataclass(frozen=True, eq=False)
-class PixelMap:
+class PixelMap(ReadOnlyArrays):
     """Gain, aim offset and state of every pixel, all [p].
 
     gain: peak displacement over that of the model; offset: aim point relative to the pixel's centre, m; sigma: standard
@@ -104,9 +104,6 @@ class PixelMap:
     offset_y_sigma_m: FloatArray
     state: StrArray
     model: str = ""
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.gain)

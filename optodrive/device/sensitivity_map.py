@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field as Item
 
 from optodrive.core.files import write_text
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, ReadOnlyArrays
 from optodrive.device.config import Config
 from optodrive.device.pixel_map import VERSION, MapFile, MappedPixel, MappedPixels, format_map_head, read_map_file
 
@@ -35,7 +35,7 @@ class _SensitivityFile(MapFile):
 
 
 @dataclass(frozen=True, eq=False)
-class SensitivityMap:
+class SensitivityMap(ReadOnlyArrays):
     """Sensitivity of a person at every pixel, both arrays [p].
 
     sensitivity: felt amplitude over that of the channel model; its mean in the logarithm is 0, because matching
@@ -46,9 +46,6 @@ class SensitivityMap:
     sigma: FloatArray
     participant: str
     trials: int
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.sensitivity)

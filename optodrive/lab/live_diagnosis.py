@@ -23,7 +23,7 @@ import numpy as np
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, RefusedError
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, ReadOnlyArrays
 from optodrive.core.types.discrepancy import Discrepancy, NextExperiment, Probabilities
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.core.types.plans import LimitedPlan
@@ -65,7 +65,7 @@ REST_S = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Experiment:
+class Experiment(ReadOnlyArrays):
     """An experiment on one pixel.
 
     pulses: [n, 4] start_s, width_s, power_w, pixel as planned, the first at LEAD_S; span_s: time that is recorded
@@ -76,9 +76,6 @@ class Experiment:
     pulses: FloatArray
     pixel: int
     span_s: float
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
 
 def find_pixels(config: Config) -> tuple[int, int]:
@@ -102,10 +99,8 @@ def plan_first_experiments(display: DisplayModel, pixel: int, neighbour: int) ->
         ladder.append((hold_s, laser.max_power_w, neighbour, LADDER_REST_S))
     widths = [(min(width_s, hold_s), laser.max_power_w, pixel, WIDTHS_REST_S) for width_s in WIDTHS_S]
     train = [(min(TRAIN_WIDTH_S, hold_s), laser.max_power_w, pixel, TRAIN_GAP_S)] * TRAIN_COUNT
-    return {
-        name: plan_experiment(display, name, _place(rows), pixel)
-        for name, rows in (("ladder", ladder), ("widths", widths), ("train", train))
-    }
+    kinds = {"ladder": ladder, "widths": widths, "train": train}
+    return {name: plan_experiment(display, name, _place(rows), pixel) for name, rows in kinds.items()}
 
 
 def plan_proposal(display: DisplayModel, proposal: NextExperiment) -> Experiment:
@@ -203,9 +198,8 @@ class CampaignRecording:
         for run in self.runs:
             if run.attributes.get("display") != display or "group" not in run.attributes:
                 stated = run.attributes.get("display", "none")
-                raise InputError(
-                    f"{path}: {run.name}: display", stated, f"{display!r}, which the campaign goes on with"
-                )
+                expected = f"{display!r}, which the campaign goes on with"
+                raise InputError(f"{path}: {run.name}: display", stated, expected)
 
     @property
     def measurement(self) -> Measurement:
@@ -262,14 +256,8 @@ def run_campaign(
         bench.disarm()
         on_run("")
         diagnosis: Discrepancy = bench.run_elsewhere(diagnose, recording.measurement, display.config)
-        step = CampaignStep(
-            bench.now_s() - began_s,
-            len(recording.runs),
-            tuple(played),
-            diagnosis.verdict,
-            diagnosis.causes,
-            name_probabilities(diagnosis.probabilities),
-        )
+        found = diagnosis.verdict, diagnosis.causes, name_probabilities(diagnosis.probabilities)
+        step = CampaignStep(bench.now_s() - began_s, len(recording.runs), tuple(played), *found)
         steps.append(step)
         played.clear()
         on_step(step)
@@ -339,10 +327,8 @@ class BoardBench:
         pulses = np.column_stack([start_s, executed.width_s, executed.power_w, executed.pixel])
         t_s: FloatArray = np.arange(count, dtype=np.float64) * (step_us * 1e-6)
         signals = {name: Signal(experiment.pixel, t_s, value) for name, value in values.items()}
-        attributes: dict[str, str | float] = {
-            "started_at": started,
-            "bridge_width_m": board.config.display.bridge_width_m,
-        }
+        width_m = board.config.display.bridge_width_m
+        attributes: dict[str, str | float] = {"started_at": started, "bridge_width_m": width_m}
         return Run(experiment.name, board.display.ambient_k, pulses, signals, attributes)
 
     def run_elsewhere(self, function: Callable[..., Any], *arguments: object) -> Any:

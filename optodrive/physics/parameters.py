@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.plausibility import PlausibleRange, guess_unit
 from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, ReadOnlyArrays
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_file import locate_shipped
 from optodrive.device.config_sections import BridgeWidth
@@ -135,7 +135,7 @@ class ParameterSet(_SiUnits):
 
 
 @dataclass(frozen=True, eq=False)
-class PixelArray:
+class PixelArray(ReadOnlyArrays):
     """Nominal parameters of every pixel of a display, each [p], with names and units as in `Pixel`."""
 
     r_k_per_w: FloatArray
@@ -144,9 +144,6 @@ class PixelArray:
     tau_g_s: FloatArray
     kappa_m_per_k: FloatArray
     phi_n_per_k: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.r_k_per_w)

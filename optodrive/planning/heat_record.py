@@ -43,7 +43,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, refuse_os_error
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState
@@ -387,7 +387,7 @@ class HeatRecord:
         np.savez(buffer, **columns)
         payload = buffer.getvalue()
         data = MAGIC + sha256(payload).digest() + payload
-        try:
+        with refuse_os_error(self.path, "a file that can be written; nothing is emitted"):
             # In place and not by rename: the lock and the status of this very file are the trust.
             os.ftruncate(self._file, len(data))
             written = 0
@@ -395,8 +395,6 @@ class HeatRecord:
                 written += os.pwrite(self._file, data[written:], written)
             # On the disk before light: a computer that loses power then finds a display in use, which is hot.
             os.fsync(self._file)
-        except OSError as error:
-            raise InputError(str(self.path), error.strerror, "a file that can be written; nothing is emitted") from None
 
     def describe(self) -> str:
         """Return how warm the display counts, and why, in one line, after load()."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.core.files import atomic_write
-from optodrive.core.quantity import format_quantity, m_to_um
+from optodrive.core.quantity import format_quantity, list_names, m_to_um
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.report import FeasibilityReport
@@ -104,7 +104,7 @@ def describe_dead_pixels(dead: tuple[int, ...]) -> str | None:
     if len(dead) == 1:
         return f"pixel {dead[0]} is dead: omitted"
     if len(dead) > DEAD_LISTED_MAX:
-        listed = f"{', '.join(map(str, dead[:DEAD_LISTED_MAX]))} and {len(dead) - DEAD_LISTED_MAX} more"
+        listed = list_names(dead, DEAD_LISTED_MAX)
     else:
         listed = f"{', '.join(map(str, dead[:-1]))} and {dead[-1]}"
     return f"pixels {listed} are dead: omitted"

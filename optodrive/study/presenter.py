@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from optodrive.core.errors import InputError, RefusedError
-from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, IntArray, ReadOnlyArrays
 from optodrive.device.config import Config
 from optodrive.link.simulator.virtual_run import START_LEAD_S, VirtualBoards
 from optodrive.planning.display_model import DisplayModel
@@ -24,7 +24,7 @@ COOLING_STEP_S, COOLING_MAX_S = 5.0, 600.0
 
 
 @dataclass(frozen=True, eq=False)
-class Presentation:
+class Presentation(ReadOnlyArrays):
     """A stimulus as the board reports it, one row per pulse, all arrays [n].
 
     onset_s: gate on of the first pulse on the board's clock; start_s: counted from it
@@ -40,9 +40,6 @@ class Presentation:
     fault: str | None
     cooling_s: float = 0.0
     onset_monotonic_s: float | None = None
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @property
     def duration_s(self) -> float:

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from optodrive.core.errors import BusyError, InputError, Unquoted
+from optodrive.core.errors import BusyError, InputError, Unquoted, refuse_os_error
 from optodrive.study.study_file import SIMULATED_PREFIX, Study, Value
 
 FORMAT, VERSION = "optodrive-trials", 1
@@ -176,10 +176,8 @@ class TrialLog:
 
 def read_log(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the first record of a log and the trials that count, in order. Raise InputError."""
-    try:
+    with refuse_os_error(path, "a readable file"):
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
     lines = content[: content.rfind(b"\n") + 1].splitlines()
     records = [_parse_line(f"{path}: line {k}", line) for k, line in enumerate(lines, start=1)]
     if not records or records[0].get("format") != FORMAT:
@@ -190,21 +188,14 @@ def read_log(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 def has_stimuli(path: Path) -> bool:
     """Return whether a log has a stimulus that was or may have been shown. Raise InputError as `read_log`."""
-    try:
-        with path.open("rb") as file:
-            lines = enumerate(file, start=1)
-            return any(
-                _parse_line(f"{path}: line {k}", line)["record"] in SHOWN for k, line in lines if line[-1:] == b"\n"
-            )
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
+    with refuse_os_error(path, "a readable file"), path.open("rb") as file:
+        lines = enumerate(file, start=1)
+        return any(_parse_line(f"{path}: line {k}", line)["record"] in SHOWN for k, line in lines if line[-1:] == b"\n")
 
 
 def _open_locked(path: Path) -> Any:
-    try:
+    with refuse_os_error(path, "a file that can be written"):
         file = path.open("a+b", buffering=0)  # no rest is written again when the file is closed
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a file that can be written") from None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.errors import InputError, Unquoted, refuse_os_error
 from optodrive.core.files import read_regular_file
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.fingers import FingerReport
@@ -89,10 +89,8 @@ class FilmRecorder:
     """Writes a recording while its events come. Raises InputError if the file exists or cannot be written."""
 
     def __init__(self, path: Path, axes: FilmAxes) -> None:
-        try:
+        with refuse_os_error(path, "a new file that can be written"):
             self._file = path.open("x", encoding="utf-8")
-        except OSError as error:
-            raise InputError(str(path), error.strerror or str(error), "a new file that can be written") from None
         slots = FilmAxis(0, axes.slots - 1, 0)
         lines = [HEAD, f"N: {axes.name}"]
         for code, axis in ((ABS_MT_SLOT, slots), (ABS_MT_POSITION_X, axes.x), (ABS_MT_POSITION_Y, axes.y)):

@@ -16,12 +16,11 @@ import typer
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import list_written, print_answer
 from optodrive.core.errors import InputError
-from optodrive.core.quantity import m_to_um
+from optodrive.core.quantity import list_names, m_to_um
 
 if TYPE_CHECKING:
     from optodrive.lab.calibration.field_fit import FieldFit
 if TYPE_CHECKING:
-    from optodrive.core.types.arrays import BoolArray
     from optodrive.lab.calibration.picture_spots import CameraMeasurement
 
 
@@ -75,10 +74,8 @@ def format_fit(stats: dict[str, Any], first_line: int) -> list[str]:
     outlier_rows = stats["outlier_rows"]
     lines = [f"spots            {stats['spots']}, {len(outlier_rows)} of them outliers"]
     if outlier_rows:
-        listed = ", ".join(str(row + first_line) for row in outlier_rows[:OUTLIERS_LISTED_MAX])
-        omitted = len(outlier_rows) - OUTLIERS_LISTED_MAX
-        more = f" and {omitted} more" if omitted > 0 else ""
-        lines.append(f"outliers         line{'s' if len(outlier_rows) > 1 else ''} {listed}{more}")
+        listed = list_names([row + first_line for row in outlier_rows], OUTLIERS_LISTED_MAX)
+        lines.append(f"outliers         line{'s' if len(outlier_rows) > 1 else ''} {listed}")
     lines += [
         f"residual         {stats['residual_rms_um']:.1f} µm rms, {stats['residual_max_um']:.1f} µm max",
         f"noise            {stats['noise_um']:.1f} µm per axis; "
@@ -170,22 +167,19 @@ def calibrate_by_camera(folder: Path, config: str | None) -> FieldCalibration:
     check_spots(str(path), measured.spots, prior)
     fit = fit_field(measured.spots, prior)
     check_fit(str(path), fit)
-    outliers = [name for name, is_outlier in zip(measured.names, fit.outlier, strict=True) if is_outlier]
-    return FieldCalibration(
-        fit,
-        path,
-        build_camera_stats(measured, outliers, path),
-        format_camera_stats(measured, outliers, path, replaced),
-    )
+    masks = {"outlier": fit.outlier, "saturated": measured.is_saturated, "outside": measured.is_outside}
+    pictures = {
+        key: [name for name, is_selected in zip(measured.names, mask, strict=True) if is_selected]
+        for key, mask in masks.items()
+    }
+    stats = {"spots_file": str(path), **{f"{key}_pictures": names for key, names in pictures.items()}}
+    lines = format_camera_stats(measured, pictures, f"spots {'replaced' if replaced else 'written '}   {path}")
+    return FieldCalibration(fit, path, stats | build_camera_stats(measured), lines)
 
 
-def build_camera_stats(measured: "CameraMeasurement", outliers: list[str], spots_file: Path) -> dict[str, object]:
+def build_camera_stats(measured: "CameraMeasurement") -> dict[str, object]:
     """Build the statistics that the camera adds to those of the fit, for --json."""
     return {
-        "spots_file": str(spots_file),
-        "outlier_pictures": outliers,
-        "outside_pictures": _select_names(measured, measured.is_outside),
-        "saturated_pictures": _select_names(measured, measured.is_saturated),
         "grid_pictures": measured.view_count,
         "pixel_um": round(m_to_um(measured.pixel_scale_m), 3),
         "corners_rms_px": round(measured.plane.residual_px, 4),
@@ -193,12 +187,10 @@ def build_camera_stats(measured: "CameraMeasurement", outliers: list[str], spots
     }
 
 
-def format_camera_stats(
-    measured: "CameraMeasurement", outliers: list[str], spots_file: Path, replaced: bool
-) -> tuple[str, ...]:
+def format_camera_stats(measured: "CameraMeasurement", pictures: dict[str, list[str]], written: str) -> tuple[str, ...]:
     """Format the statistics of the camera as text lines.
 
-    replaced: whether the spots of an earlier measurement were in the file
+    pictures: names of those that are suspect, by kind; written: last line
     """
     sigma_um = sorted(m_to_um(sigma_m) for sigma_m in measured.sigma_m.tolist())
     lines = [
@@ -207,22 +199,12 @@ def format_camera_stats(
         f"from {measured.view_count} picture{'s' if measured.view_count > 1 else ''}",
         f"centroids        sigma {median(sigma_um):.1f} µm per axis, {sigma_um[-1]:.1f} µm max",
     ]
-    saturated, outside = (_select_names(measured, mask) for mask in (measured.is_saturated, measured.is_outside))
-    if outliers:
-        lines.append(f"outlier pictures {_join_names(outliers)}")
-    if saturated:
-        lines.append(f"saturated        {_join_names(saturated)}")
-    if outside:
-        lines.append(
-            f"warning          {_join_names(outside)} outside the grid: the camera model is extrapolated there"
-        )
-    return (*lines, f"spots {'replaced' if replaced else 'written '}   {spots_file}")
-
-
-def _select_names(measured: "CameraMeasurement", mask: "BoolArray") -> list[str]:
-    return [name for name, is_selected in zip(measured.names, mask, strict=True) if is_selected]
-
-
-def _join_names(names: list[str]) -> str:
-    omitted = len(names) - NAMES_LISTED_MAX
-    return ", ".join(names[:NAMES_LISTED_MAX]) + (f" and {omitted} more" if omitted > 0 else "")
+    outside = " outside the grid: the camera model is extrapolated there"
+    for key, label, end in (
+        ("outlier", "outlier pictures", ""),
+        ("saturated", "saturated       ", ""),
+        ("outside", "warning         ", outside),
+    ):
+        if pictures[key]:
+            lines.append(f"{label} {list_names(pictures[key], NAMES_LISTED_MAX)}{end}")
+    return (*lines, written)

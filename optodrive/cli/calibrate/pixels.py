@@ -9,7 +9,7 @@ from optodrive.cli.commissioning import confirm_emission
 from optodrive.cli.options import ConfigOption, JsonOption, ModelOption, load_run_config
 from optodrive.cli.output import announce_compilation, print_answer, print_json, show_progress
 from optodrive.core.errors import MISSING, InputError
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, list_names
 
 if TYPE_CHECKING:
     from optodrive.device.config import Config
@@ -272,8 +272,4 @@ def _print_stats(stats: dict[str, Any]) -> None:
 
 
 def _join_indices(indices: list[int]) -> str:
-    if not indices:
-        return "none"
-    omitted = len(indices) - PIXELS_LISTED_MAX
-    more = f" and {omitted} more" if omitted > 0 else ""
-    return f"{len(indices)}: {', '.join(map(str, indices[:PIXELS_LISTED_MAX]))}{more}"
+    return f"{len(indices)}: {list_names(indices, PIXELS_LISTED_MAX)}" if indices else "none"

@@ -17,3 +17,11 @@ def freeze_arrays(instance: object) -> None:
     for value in vars(instance).values():
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
+
+
+class ReadOnlyArrays:
+    """Base of dataclasses whose array fields are read-only."""
+
+    def __post_init__(self) -> None:
+        """Make every array field read-only."""
+        freeze_arrays(self)

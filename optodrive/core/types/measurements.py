@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass, field
 
-from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, IntArray, ReadOnlyArrays
 
 MIRRORS = -1
 """Index of the mirrors where that of a pixel is asked for."""
 
 
 @dataclass(frozen=True, eq=False)
-class PixelTrace:
+class PixelTrace(ReadOnlyArrays):
     """Simulated signals of p pixels over time.
 
     t_s: [m]; absorber_k and gas_k (rises above ambient), displacement_m, force_n: [m, p]
@@ -22,12 +22,9 @@ class PixelTrace:
     displacement_m: FloatArray
     force_n: FloatArray
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
 
 @dataclass(frozen=True, eq=False)
-class Signal:
+class Signal(ReadOnlyArrays):
     """Measured signal of one pixel.
 
     t_s: [m] increasing; value: [m], NaN where missing; sigma: stated noise, if any
@@ -38,12 +35,9 @@ class Signal:
     value: FloatArray
     sigma: float | None = None
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(ReadOnlyArrays):
     """Run of a recording: the drive as commanded and the signals measured meanwhile.
 
     pulses: [n, 4] start_s, width_s, power_w, pixel; signals: by the names of the recording format; attributes: as in
@@ -56,9 +50,6 @@ class Run:
     signals: dict[str, Signal]
     attributes: dict[str, str | float] = field(default_factory=dict)
     commands: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
 
 @dataclass(frozen=True)

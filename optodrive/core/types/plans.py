@@ -4,11 +4,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from optodrive.core.types.arrays import FloatArray, IntArray, StrArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, IntArray, ReadOnlyArrays, StrArray
 
 
 @dataclass(frozen=True, eq=False)
-class PulsePlan:
+class PulsePlan(ReadOnlyArrays):
     """Timed pulses of all beams before the limiter, one row per pulse, in order of their starts, all arrays [n].
 
     start_s: gate-on time from the plan's start, whole microseconds; width_s: gate-on duration, whole PWM periods
@@ -33,9 +33,6 @@ class PulsePlan:
     requested_start_s: FloatArray
     source: IntArray
     stage: IntArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.start_s)
@@ -82,7 +79,7 @@ class LimitedPlan(PulsePlan):
 
 
 @dataclass(frozen=True, eq=False)
-class BudgetState:
+class BudgetState(ReadOnlyArrays):
     """State of the limiter between plans. Passed pulses count as executed until the board reports otherwise.
 
     at_s: end of the last pulse of any stage, on the budget's time line; begun_s: start of the last one
@@ -124,12 +121,9 @@ class BudgetState:
     recent_pixel: IntArray
     recent_stage: IntArray
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
 
 @dataclass(frozen=True, eq=False)
-class ExecutedPulses:
+class ExecutedPulses(ReadOnlyArrays):
     """Pulses that the board reports as executed, one row per pulse in order, all arrays [n].
 
     on_tick: tick of gate on, of the board, or of the host if there are several stages; width_ticks: gate-on duration;
@@ -146,9 +140,6 @@ class ExecutedPulses:
     width_s: FloatArray
     stage: IntArray
     complete: bool
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.on_tick)

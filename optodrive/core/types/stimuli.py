@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, ReadOnlyArrays
 
 
 @dataclass(frozen=True, eq=False)
-class TactileFrame:
+class TactileFrame(ReadOnlyArrays):
     """One tactile image: the peak displacement that it requests of each pixel while it is shown.
 
     target_m: [p] requested peak displacement, m; 0 for inactive pixels
@@ -23,9 +23,6 @@ class TactileFrame:
     target_m: FloatArray
     simultaneous: bool = False
     priority: int = 0
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
 
 @dataclass(frozen=True)

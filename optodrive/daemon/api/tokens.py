@@ -13,7 +13,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field, ValidationError
 
-from optodrive.core.errors import MISSING, InputError, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, refuse_os_error, suggest_nearest
 from optodrive.core.files import lock_folder, read_regular_file, write_private_text
 from optodrive.core.toml_model import Section, build_input_error, check_format, read_toml
 
@@ -152,11 +152,9 @@ def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
         f'\n[[token]] # {PERMISSIONS[t.role]}\nname = "{t.name}"\nrole = "{t.role}"\nsecret = {json.dumps(t.secret)}\n'
         for t in tokens.all
     ]
-    try:
+    with refuse_os_error(path, "a writable path for the daemon's tokens"):
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         write_private_text(path, "".join(lines))
-    except OSError as error:
-        raise InputError(str(path), error.strerror, "a writable path for the daemon's tokens") from None
     return tokens
 
 
@@ -231,10 +229,8 @@ def remove_token(path: Path, name: str) -> Token:
 
 def write_holder_file(path: Path, token: Token) -> None:
     """Write a new file of mode 0600 with one token, for `OPTODRIVE_TOKENS` of its holder."""
-    try:
+    with refuse_os_error(path, "a path for a new file"):
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
-    except OSError as error:
-        raise InputError(str(path), error.strerror, "a path for a new file") from None
     try:
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
             file.write(HEAD + format_token(token))

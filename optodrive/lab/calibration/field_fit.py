@@ -3,12 +3,13 @@
 Every parameter is in units of its prior's sigma: the prior of z is the standard normal distribution.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import log, pi
 
 import numpy as np
 
-from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, ReadOnlyArrays
 from optodrive.device.calibrated_field import TERM_COUNT, CalibratedField, compute_prior_widths, evaluate_terms
 from optodrive.device.field_geometry import CENTRE_CODE, FieldGeometry, beam_position_m, compute_parameter_derivatives
 from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
@@ -36,25 +37,50 @@ SAMPLES_PER_SIDE = 9
 
 
 @dataclass(frozen=True, eq=False)
-class FieldFit:
-    """A fitted field with its data and its uncertainty.
+class FieldFit(ReadOnlyArrays):
+    """A field fitted to spots, also on the way to the best one.
 
-    outlier: [n] rejected spots; residual_m: [n, 2] measured less fitted; noise_m, surface_m: rms per axis, fitted
-    covariance: [u, u] of all parameters in units of parameter_sigma [u]
+    terms: [n, t] of the surface at the spots; noise_m, surface_m: of a spot and of the surface, rms per axis;
+    z: [u] parameters in units of their sigma; weight: [n] of each spot, 0 to 1; outlier_fraction: expected
     """
 
-    field: CalibratedField
     spots: MeasuredSpots
     prior: FieldPrior
-    outlier: BoolArray
-    residual_m: FloatArray
+    terms: FloatArray
     noise_m: float
     surface_m: float
-    parameter_sigma: FloatArray
-    covariance: FloatArray
+    z: FloatArray
+    weight: FloatArray
+    outlier_fraction: float = OUTLIER_FRACTION_PRIOR
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
+    @cached_property
+    def parameter_sigma(self) -> FloatArray:
+        """Prior sigma of each parameter, [u]."""
+        return _compute_parameter_sigma(self.prior, self.surface_m)
+
+    @cached_property
+    def geometry(self) -> FieldGeometry:
+        """The fitted geometry."""
+        return FieldGeometry(*(np.array(self.prior.mean) + self.z[:GEOMETRY_COUNT] * self.prior.sigma).tolist())
+
+    @cached_property
+    def coefficients_m(self) -> FloatArray:
+        """Coefficients of the surface, [2, terms]."""
+        surface = self.z[GEOMETRY_COUNT:] * self.parameter_sigma[GEOMETRY_COUNT:]
+        return np.asarray(surface.reshape(2, TERM_COUNT), dtype=np.float64)
+
+    @cached_property
+    def residual_m(self) -> FloatArray:
+        """Measured less fitted positions, [n, 2]."""
+        angles_rad = (np.stack([self.spots.x_code, self.spots.y_code]) - CENTRE_CODE) * self.prior.rad_per_code
+        fitted_m = np.stack(beam_position_m(self.geometry, *angles_rad))
+        residual_m = np.stack([self.spots.x_m, self.spots.y_m]) - fitted_m - self.coefficients_m @ self.terms.T
+        return np.asarray(residual_m.T, dtype=np.float64)
+
+    @property
+    def outlier(self) -> BoolArray:
+        """Rejected spots, [n]."""
+        return np.asarray(self.weight < 0.5)
 
     @property
     def rms_m(self) -> float:
@@ -62,20 +88,109 @@ class FieldFit:
         inlier_m = self.residual_m[~self.outlier]
         return float(np.sqrt((inlier_m**2).sum(axis=1).mean())) if len(inlier_m) else float("nan")
 
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of all parameters in units of their sigma, [u, u]."""
+        matrix, _ = self._linearise(self.noise_m)
+        return np.asarray(np.linalg.inv(matrix + np.eye(PARAMETER_COUNT)), dtype=np.float64)
+
+    @cached_property
+    def field(self) -> CalibratedField:
+        """The field, with its uncertainty."""
+        grid_sigma_m = self.sigma_m(*self.prior.extent.build_grid(SIGMA_GRID_NODES))
+        return CalibratedField(
+            geometry=self.geometry,
+            surface_m=self.coefficients_m,
+            extent=self.prior.extent,
+            rad_per_code=self.prior.rad_per_code,
+            focal_length_m=self.prior.focal_length_m,
+            sigma_grid_m=grid_sigma_m.reshape(SIGMA_GRID_NODES, SIGMA_GRID_NODES),
+            display=self.prior.display,
+            wiring=self.prior.wiring,
+        )
+
     def jacobian_m(self, x_code: FloatArray, y_code: FloatArray) -> FloatArray:
         """Return the derivatives of positions at codes [n] by each parameter, m, [2, n, u]."""
-        return _jacobian(self.field.geometry, self.prior, self.parameter_sigma, x_code, y_code)
+        jacobian = np.zeros((2, len(x_code), PARAMETER_COUNT))
+        x_rad, y_rad = ((code - CENTRE_CODE) * self.prior.rad_per_code for code in (x_code, y_code))
+        derivatives = compute_parameter_derivatives(self.geometry, self.prior.sigma, x_rad, y_rad)
+        jacobian[:, :, :GEOMETRY_COUNT] = derivatives
+        surface = evaluate_terms(self.prior.extent, x_code, y_code)
+        for axis in range(2):
+            begin = GEOMETRY_COUNT + axis * TERM_COUNT
+            part = slice(begin, begin + TERM_COUNT)
+            jacobian[axis, :, part] = surface * self.parameter_sigma[part]
+        return jacobian
+
+    def sigma_m(self, x_code: FloatArray, y_code: FloatArray) -> FloatArray:
+        """Return one sigma at codes [n] per axis, averaged over both axes, m, [n]."""
+        jacobian = self.jacobian_m(x_code, y_code)
+        variance = np.einsum("anu,uv,anv->n", jacobian, self.covariance, jacobian, optimize=True) / 2.0
+        return np.asarray(np.sqrt(variance))
+
+    def _linearise(self, noise_m: float) -> tuple[FloatArray, FloatArray]:
+        """Return matrix [u, u] and vector [u] of the linearised problem without its prior."""
+        jacobian = self.jacobian_m(self.spots.x_code, self.spots.y_code)
+        weighted = jacobian * (self.weight / noise_m**2)[None, :, None]
+        matrix = np.tensordot(weighted, jacobian, ([0, 1], [0, 1]))
+        return matrix, np.tensordot(weighted, self.residual_m.T, ([0, 1], [0, 1]))
+
+    def converge(self, noise_m: float, count: int = GAUSS_NEWTON_STEPS) -> "FieldFit":
+        """Take full Gauss-Newton steps. The problem is nearly linear, so that no step overshoots."""
+        fit = self
+        for _ in range(count):
+            matrix, vector = fit._linearise(noise_m)
+            step = np.linalg.solve(matrix + np.eye(PARAMETER_COUNT), vector - fit.z)
+            fit = replace(fit, z=np.asarray(fit.z + step, dtype=np.float64))
+        return fit
+
+    def anneal(self) -> "FieldFit":
+        """Fit from the nominal geometry at decreasing noise scales, weighting each spot by its inlier probability."""
+        fit = self
+        for scale_m in ANNEALING_NOISE_M:
+            for _ in range(GAUSS_NEWTON_STEPS):
+                fit = replace(fit, weight=fit._compute_inlier_probability(scale_m)).converge(scale_m, 1)
+        return fit.classify_outliers()
+
+    def _compute_inlier_probability(self, scale_m: float | FloatArray) -> FloatArray:
+        """Return each spot's probability of being an inlier at a noise scale, [n]."""
+        distance2 = (self.residual_m**2).sum(axis=1)
+        inlier_density = (1.0 - self.outlier_fraction) * np.exp(-0.5 * distance2 / scale_m**2) / (2.0 * pi * scale_m**2)
+        return np.asarray(inlier_density / (inlier_density + self.outlier_fraction / self.prior.field_area_m2))
+
+    def classify_outliers(self) -> "FieldFit":
+        """Classify each spot as inlier or outlier from its residual and the field's uncertainty there."""
+        scale_m = np.hypot(self.noise_m, self.sigma_m(self.spots.x_code, self.spots.y_code))
+        weight = (self._compute_inlier_probability(scale_m) > 0.5).astype(np.float64)
+        outliers = len(weight) - weight.sum() + OUTLIER_PRIOR_SPOTS * OUTLIER_FRACTION_PRIOR
+        return replace(self, weight=weight, outlier_fraction=float(outliers / (len(weight) + OUTLIER_PRIOR_SPOTS)))
+
+    def estimate_scales(self, known_noise_m: float | None) -> "FieldFit":
+        """Select the jointly most probable noise and surface, marginalised over the parameters."""
+        matrix, vector = self._linearise(1.0)
+        square, count = float((self.weight * self.residual_m.T**2).sum()), 2.0 * float(self.weight.sum())
+        best, chosen = -np.inf, self
+        for noise in SCALE_FACTORS if known_noise_m is None else [known_noise_m / self.prior.noise_m]:
+            for surface in SCALE_FACTORS:
+                noise_m, surface_m = noise * self.prior.noise_m, surface * self.prior.surface_m
+                # The Jacobian of a parameter scales with its prior sigma.
+                scale_ratio = _compute_parameter_sigma(self.prior, surface_m) / self.parameter_sigma
+                precision = matrix * np.outer(scale_ratio, scale_ratio) / noise_m**2 + np.eye(PARAMETER_COUNT)
+                z = self.z / scale_ratio
+                gradient = vector * scale_ratio / noise_m**2 - z
+                root = np.linalg.cholesky(precision)
+                gain = np.linalg.solve(root, gradient)
+                log_probability = -0.5 * (square / noise_m**2 + z @ z - gain @ gain)
+                log_probability -= count * log(noise_m) + float(np.log(np.diag(root)).sum())
+                log_probability -= 0.5 * (log(surface) / SURFACE_LOG_SIGMA) ** 2
+                log_probability -= 0.5 * (log(noise) / NOISE_LOG_SIGMA) ** 2
+                if log_probability > best:
+                    best, chosen = log_probability, replace(self, noise_m=noise_m, surface_m=surface_m)
+        return replace(chosen, z=self.z * self.parameter_sigma / chosen.parameter_sigma)
 
 
-@dataclass(frozen=True)
-class _Scales:
-    """Noise of a spot and rms of the surface, both per axis, m."""
-
-    noise_m: float
-    surface_m: float
-
-    def parameter_sigma(self, prior: FieldPrior) -> FloatArray:
-        return np.concatenate([prior.sigma, np.tile(self.surface_m * compute_prior_widths(), 2)])
+def _compute_parameter_sigma(prior: FieldPrior, surface_m: float) -> FloatArray:
+    return np.concatenate([prior.sigma, np.tile(surface_m * compute_prior_widths(), 2)])
 
 
 def fit_field(spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None = None) -> FieldFit:
@@ -83,185 +198,16 @@ def fit_field(spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None = N
 
     noise_m: noise of a spot per axis, m; fitted if None.
     """
-    fitter = _FieldFitter(spots, prior, noise_m)
-    fitter.anneal()
+    terms, noise_start_m = evaluate_terms(prior.extent, spots.x_code, spots.y_code), noise_m or prior.noise_m
+    fit = FieldFit(
+        spots, prior, terms, noise_start_m, prior.surface_m, np.zeros(PARAMETER_COUNT), np.ones(len(spots))
+    ).anneal()
     for _ in range(OUTER_ITERATIONS):
-        previous_weight = fitter.weight.copy()
-        fitter.converge()
-        fitter.estimate_scales()
-        fitter.classify_outliers()
-        if np.array_equal(previous_weight, fitter.weight):
+        previous_weight = fit.weight
+        fit = fit.converge(fit.noise_m).estimate_scales(noise_m).classify_outliers()
+        if np.array_equal(previous_weight, fit.weight):
             break
-    fitter.converge()
-    return fitter.build_result()
-
-
-class _FieldFitter:
-    """State of a fit.
-
-    z: [u] parameters in units of their sigma
-    weight: [n] of each spot, 0 to 1
-    """
-
-    def __init__(self, spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None) -> None:
-        self.spots, self.prior, self.known_noise_m = spots, prior, noise_m
-        self.scales = _Scales(noise_m or prior.noise_m, prior.surface_m)
-        self.z = np.zeros(PARAMETER_COUNT)
-        self.weight = np.ones(len(spots))
-        self.outlier_fraction = OUTLIER_FRACTION_PRIOR
-        self.surface_terms = evaluate_terms(prior.extent, spots.x_code, spots.y_code)
-        self.measured_m = np.stack([spots.x_m, spots.y_m])
-
-    @property
-    def parameter_sigma(self) -> FloatArray:
-        return self.scales.parameter_sigma(self.prior)
-
-    @property
-    def geometry(self) -> FieldGeometry:
-        return FieldGeometry(*(np.array(self.prior.mean) + self.z[:GEOMETRY_COUNT] * self.prior.sigma).tolist())
-
-    def surface_coefficients_m(self) -> FloatArray:
-        coefficients: FloatArray = (self.z[GEOMETRY_COUNT:] * self.parameter_sigma[GEOMETRY_COUNT:]).reshape(
-            2, TERM_COUNT
-        )
-        return coefficients
-
-    def angles_rad(self) -> FloatArray:
-        codes = np.stack([self.spots.x_code, self.spots.y_code])
-        return (codes - CENTRE_CODE) * self.prior.rad_per_code
-
-    def residual_m(self) -> FloatArray:
-        """Return measured less fitted positions, m, [2, n]."""
-        residual: FloatArray = (
-            self.measured_m
-            - np.stack(beam_position_m(self.geometry, *self.angles_rad()))
-            - self.surface_coefficients_m() @ self.surface_terms.T
-        )
-        return residual
-
-    def _normal_equations(self, noise_m: float) -> tuple[FloatArray, FloatArray]:
-        """Return matrix [u, u] and vector [u] of the linearised problem without its prior."""
-        jacobian = _jacobian(self.geometry, self.prior, self.parameter_sigma, self.spots.x_code, self.spots.y_code)
-        weighted = jacobian * (self.weight / noise_m**2)[None, :, None]
-        return np.tensordot(weighted, jacobian, ([0, 1], [0, 1])), np.tensordot(
-            weighted, self.residual_m(), ([0, 1], [0, 1])
-        )
-
-    def gauss_newton_step(self, noise_m: float) -> None:
-        """Take one full Gauss-Newton step. The problem is nearly linear, so that no step overshoots."""
-        matrix, vector = self._normal_equations(noise_m)
-        step = np.linalg.solve(matrix + np.eye(PARAMETER_COUNT), vector - self.z)
-        self.z = np.asarray(self.z + step, dtype=np.float64)
-
-    def anneal(self) -> None:
-        """Fit from the nominal geometry at decreasing noise scales, weighting each spot by its inlier probability."""
-        for scale_m in ANNEALING_NOISE_M:
-            for _ in range(GAUSS_NEWTON_STEPS):
-                self.weight = self._inlier_probability(scale_m)
-                self.gauss_newton_step(scale_m)
-        self.classify_outliers()
-
-    def converge(self) -> None:
-        """Iterate to the most probable parameters at the current weights and scales."""
-        for _ in range(GAUSS_NEWTON_STEPS):
-            self.gauss_newton_step(self.scales.noise_m)
-
-    def _inlier_probability(self, scale_m: float | FloatArray) -> FloatArray:
-        """Return each spot's probability of being an inlier at a noise scale, [n]."""
-        distance2 = (self.residual_m() ** 2).sum(axis=0)
-        inlier_density = (1.0 - self.outlier_fraction) * np.exp(-0.5 * distance2 / scale_m**2) / (2.0 * pi * scale_m**2)
-        probability: FloatArray = inlier_density / (inlier_density + self.outlier_fraction / self.prior.field_area_m2)
-        return probability
-
-    def classify_outliers(self) -> None:
-        """Classify each spot as inlier or outlier from its residual and the field's uncertainty there."""
-        scale_m = np.hypot(self.scales.noise_m, self._sigma_m())
-        self.weight = (self._inlier_probability(scale_m) > 0.5).astype(np.float64)
-        outlier_count = len(self.weight) - self.weight.sum()
-        self.outlier_fraction = float(
-            (outlier_count + OUTLIER_PRIOR_SPOTS * OUTLIER_FRACTION_PRIOR) / (len(self.weight) + OUTLIER_PRIOR_SPOTS)
-        )
-
-    def _covariance(self) -> FloatArray:
-        matrix, _ = self._normal_equations(self.scales.noise_m)
-        return np.asarray(np.linalg.inv(matrix + np.eye(PARAMETER_COUNT)), dtype=np.float64)
-
-    def _sigma_m(self) -> FloatArray:
-        jacobian = _jacobian(self.geometry, self.prior, self.parameter_sigma, self.spots.x_code, self.spots.y_code)
-        return _sigma_m(jacobian, self._covariance())
-
-    def estimate_scales(self) -> None:
-        """Select the jointly most probable noise and surface, marginalised over the parameters."""
-        matrix, vector = self._normal_equations(1.0)
-        residual_m = self.residual_m()
-        square, count = float((self.weight * residual_m**2).sum()), 2.0 * float(self.weight.sum())
-        best, chosen = -np.inf, self.scales
-        for noise in SCALE_FACTORS if self.known_noise_m is None else [self.known_noise_m / self.prior.noise_m]:
-            for surface in SCALE_FACTORS:
-                scales = _Scales(noise * self.prior.noise_m, surface * self.prior.surface_m)
-                # The Jacobian of a parameter scales with its prior sigma.
-                scale_ratio = scales.parameter_sigma(self.prior) / self.parameter_sigma
-                precision = matrix * np.outer(scale_ratio, scale_ratio) / scales.noise_m**2 + np.eye(PARAMETER_COUNT)
-                z = self.z / scale_ratio
-                gradient = vector * scale_ratio / scales.noise_m**2 - z
-                root = np.linalg.cholesky(precision)
-                gain = np.linalg.solve(root, gradient)
-                log_probability = -0.5 * (square / scales.noise_m**2 + z @ z - gain @ gain)
-                log_probability -= count * log(scales.noise_m) + float(np.log(np.diag(root)).sum())
-                log_probability -= 0.5 * (log(surface) / SURFACE_LOG_SIGMA) ** 2
-                log_probability -= 0.5 * (log(noise) / NOISE_LOG_SIGMA) ** 2
-                if log_probability > best:
-                    best, chosen = log_probability, scales
-        self.z = self.z * self.parameter_sigma / chosen.parameter_sigma(self.prior)
-        self.scales = chosen
-
-    def build_result(self) -> FieldFit:
-        """Return the fit, and its field with its uncertainty."""
-        covariance, extent = self._covariance(), self.prior.extent
-        jacobian = _jacobian(self.geometry, self.prior, self.parameter_sigma, *extent.build_grid(SIGMA_GRID_NODES))
-        field = CalibratedField(
-            geometry=self.geometry,
-            surface_m=self.surface_coefficients_m(),
-            extent=extent,
-            rad_per_code=self.prior.rad_per_code,
-            focal_length_m=self.prior.focal_length_m,
-            sigma_grid_m=_sigma_m(jacobian, covariance).reshape(SIGMA_GRID_NODES, SIGMA_GRID_NODES),
-            display=self.prior.display,
-            wiring=self.prior.wiring,
-        )
-        return FieldFit(
-            field=field,
-            spots=self.spots,
-            prior=self.prior,
-            outlier=self.weight < 0.5,
-            residual_m=self.residual_m().T.copy(),
-            noise_m=self.scales.noise_m,
-            surface_m=self.scales.surface_m,
-            parameter_sigma=self.parameter_sigma,
-            covariance=covariance,
-        )
-
-
-def _jacobian(
-    geometry: FieldGeometry, prior: FieldPrior, parameter_sigma: FloatArray, x_code: FloatArray, y_code: FloatArray
-) -> FloatArray:
-    """Return the derivatives of positions at codes [n] by each parameter, m, [2, n, u]."""
-    jacobian = np.zeros((2, len(x_code), PARAMETER_COUNT))
-    x_rad, y_rad = ((code - CENTRE_CODE) * prior.rad_per_code for code in (x_code, y_code))
-    jacobian[:, :, :GEOMETRY_COUNT] = compute_parameter_derivatives(geometry, prior.sigma, x_rad, y_rad)
-    surface = evaluate_terms(prior.extent, x_code, y_code)
-    jacobian[0, :, GEOMETRY_COUNT : GEOMETRY_COUNT + TERM_COUNT] = (
-        surface * parameter_sigma[GEOMETRY_COUNT : GEOMETRY_COUNT + TERM_COUNT]
-    )
-    jacobian[1, :, GEOMETRY_COUNT + TERM_COUNT :] = surface * parameter_sigma[GEOMETRY_COUNT + TERM_COUNT :]
-    return jacobian
-
-
-def _sigma_m(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return one sigma per axis, averaged over both axes, m, [n]."""
-    variance = np.einsum("anu,uv,anv->n", jacobian, covariance, jacobian, optimize=True) / 2.0
-    sigma_m: FloatArray = np.sqrt(variance)
-    return sigma_m
+    return fit.converge(fit.noise_m)
 
 
 def select_next_spot(fit: FieldFit, candidates: FloatArray) -> int:
@@ -274,9 +220,5 @@ def select_next_spot(fit: FieldFit, candidates: FloatArray) -> int:
     candidate_covariance = candidate_jacobian @ fit.covariance
     cross_covariance = candidate_covariance @ display_jacobian.T
     measurement_covariance = candidate_covariance @ candidate_jacobian.transpose(0, 2, 1) + fit.noise_m**2 * np.eye(2)
-    variance_reduction = np.trace(
-        np.linalg.solve(measurement_covariance, cross_covariance @ cross_covariance.transpose(0, 2, 1)),
-        axis1=1,
-        axis2=2,
-    )
-    return int(np.argmax(variance_reduction))
+    reduction = np.linalg.solve(measurement_covariance, cross_covariance @ cross_covariance.transpose(0, 2, 1))
+    return int(np.argmax(np.trace(reduction, axis1=1, axis2=2)))

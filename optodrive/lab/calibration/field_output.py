@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, refuse_os_error
 from optodrive.core.files import atomic_write, write_text
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.calibrated_field import CalibratedField, format_field, strip_toml_specials
@@ -83,8 +83,7 @@ def region_sigma_m(fit: FieldFit) -> FloatArray:
     sigma_m = fit.field.sigma_m(*fit.prior.display_extent.build_grid(SAMPLES_PER_SIDE)).reshape(
         REGIONS_PER_SIDE, SAMPLES_PER_SIDE // REGIONS_PER_SIDE, REGIONS_PER_SIDE, -1
     )
-    rms_m: FloatArray = np.sqrt((sigma_m**2).mean(axis=(1, 3)))[::-1]
-    return rms_m
+    return np.asarray(np.sqrt((sigma_m**2).mean(axis=(1, 3)))[::-1], dtype=np.float64)
 
 
 def sigma_rms_m(fit: FieldFit) -> float:
@@ -127,9 +126,8 @@ def draw_sigma_map(fit: FieldFit) -> str:
         for row, line in enumerate(grid_um.tolist())
         for column, value in enumerate(line)
     ]
-    return _wrap_svg(
-        "Sigma over the field", "".join([*cells, _draw_caption(f"{low:.1f} (light) to {high:.1f} µm (dark)")])
-    )
+    caption = _draw_caption(f"{low:.1f} (light) to {high:.1f} µm (dark)")
+    return _wrap_svg("Sigma over the field", "".join([*cells, caption]))
 
 
 def _draw_caption(text: str) -> str:
@@ -153,9 +151,8 @@ def write_correction_grid(path: Path, field: CalibratedField) -> None:
     header_values = [0.0] * 63
     header_values[SCALE_INDEX] = scale
     with atomic_write(path) as temporary:
-        temporary.write_bytes(
-            HEADER.pack(FORMAT_LABEL, *header_values) + compute_corrections(field).astype("<f8").tobytes()
-        )
+        header = HEADER.pack(FORMAT_LABEL, *header_values)
+        temporary.write_bytes(header + compute_corrections(field).astype("<f8").tobytes())
 
 
 def compute_corrections(field: CalibratedField) -> FloatArray:
@@ -168,10 +165,8 @@ def compute_corrections(field: CalibratedField) -> FloatArray:
 
 def read_correction_grid(path: Path) -> tuple[float, FloatArray]:
     """Read codes per millimetre, and dx and dy [65, 65, 2]. Raise InputError for another kind of file."""
-    try:
+    with refuse_os_error(path, "a readable file"):
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
     if content[: len(FORMAT_LABEL)] != FORMAT_LABEL:
         raise InputError(f"{path}: first 22 bytes", content[:22], "LMC1COR_1.0 in UTF-16")
     if len(content) != FILE_BYTES:

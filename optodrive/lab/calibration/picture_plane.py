@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, ReadOnlyArrays
 from optodrive.lab.calibration.pictures import GridSection, Image, OriginSection, import_opencv
 
 FALLBACK_CORNERS_PER_SIDE = 4
@@ -58,11 +58,10 @@ def orient_to_marks(where: str, found: FloatArray, origin: OriginSection) -> Flo
         expected = "three corners of the grid: the first, the last of the first row, the last of the first column"
         raise InputError(f"{where}: origin.marks_px", marks.tolist(), expected)
     if along_row[0] * across[1] - along_row[1] * across[0] < 0.0:
-        raise InputError(
-            f"{where}: origin.marks_px",
-            "a grid that is mirrored in the picture",
-            "rows to the right and columns down, seen from the front: the picture is flipped or marks are exchanged",
+        expected = (
+            "rows to the right and columns down, seen from the front: the picture is flipped or marks are exchanged"
         )
+        raise InputError(f"{where}: origin.marks_px", "a grid that is mirrored in the picture", expected)
     # The detection may return any of eight orders.
     for flipped in (found, found[::-1], found[:, ::-1], found[::-1, ::-1]):
         for order in (flipped, flipped.transpose(1, 0, 2)):
@@ -83,8 +82,7 @@ def grid_corners_m(grid: GridSection, origin: OriginSection) -> FloatArray:
     right, down = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
     along = grid.pitch_m * np.stack([right, -down], axis=-1)
     cos, sin = np.cos(origin.turn_rad), np.sin(origin.turn_rad)
-    placed: FloatArray = along @ np.array([[cos, sin], [-sin, cos]]) + np.array(origin.first_corner_m)
-    return placed
+    return np.asarray(along @ np.array([[cos, sin], [-sin, cos]]) + np.array(origin.first_corner_m), dtype=np.float64)
 
 
 def _to_eight_bits(image: Image) -> Any:
@@ -109,11 +107,9 @@ def _find_chessboard(path: Path, grey: Any, grid: GridSection) -> FloatArray:
         places = places.transpose(1, 0, 2)  # the direction of rows is ambiguous as well
     rows, columns = places.shape[:2]
     if (rows, columns) != (grid.rows, grid.columns):
-        raise InputError(
-            f"{path}: corners",
-            f"{rows} × {columns}",
-            f"{grid.rows} rows × {grid.columns} columns: inner corners, one fewer than squares, all of them visible",
-        )
+        size_text = f"{grid.rows} rows × {grid.columns} columns"
+        expected = f"{size_text}: inner corners, one fewer than squares, all of them visible"
+        raise InputError(f"{path}: corners", f"{rows} × {columns}", expected)
     return places
 
 
@@ -132,7 +128,7 @@ def _not_found_error(path: Path, grid: GridSection) -> InputError:
 
 
 @dataclass(frozen=True, eq=False)
-class DisplayPlane:
+class DisplayPlane(ReadOnlyArrays):
     """Map from image positions to positions on the display.
 
     centre_px, half_diagonal_px: origin and unit of normalised image positions; camera: OpenCV matrix and distortion,
@@ -152,9 +148,6 @@ class DisplayPlane:
     residual_px: float
     grid_min_m: FloatArray
     grid_max_m: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def position_m(self, image_px: FloatArray) -> FloatArray:
         """Return the positions on the display of image positions [n, 2], m, [n, 2]."""
@@ -218,21 +211,16 @@ def _fit_parameters(
     """
     prior_sigma = np.concatenate([DISTORTION_PRIOR_SIGMA, np.full(8, np.inf)])
     matrix = np.append(parameters[5:], 1.0).reshape(3, 3)
-    scale = np.sqrt(
-        abs(np.linalg.det(matrix[:2, :2] - np.outer(_map_to_display(np.zeros((1, 2)), parameters)[0], matrix[2, :2])))
-    )
+    middle = _map_to_display(np.zeros((1, 2)), parameters)[0]
+    scale = np.sqrt(abs(np.linalg.det(matrix[:2, :2] - np.outer(middle, matrix[2, :2]))))
     noise = CORNER_NOISE_PX / half_diagonal_px * scale
     for _ in range(GAUSS_NEWTON_STEPS):
         jacobian = _jacobian(normalized, parameters).reshape(-1, len(parameters)) / noise
         residual = (targets - _map_to_display(normalized, parameters)).ravel() / noise
         normal = jacobian.T @ jacobian + np.diag(prior_sigma**-2.0)
         parameters = parameters + np.linalg.solve(normal, jacobian.T @ residual - prior_sigma**-2.0 * parameters)
-    rms = float(
-        np.sqrt(
-            ((targets - _map_to_display(normalized, parameters)) ** 2).sum()
-            / max(1, 2 * len(normalized) - len(parameters))
-        )
-    )
+    square = ((targets - _map_to_display(normalized, parameters)) ** 2).sum()
+    rms = float(np.sqrt(square / max(1, 2 * len(normalized) - len(parameters))))
     normal = jacobian.T @ jacobian * (noise / max(rms, 0.1 * noise)) ** 2 + np.diag(prior_sigma**-2.0)
     return parameters, np.linalg.inv(normal), rms / scale
 
@@ -241,10 +229,8 @@ def _map_to_display(normalized: FloatArray, parameters: FloatArray) -> FloatArra
     """Map normalised image positions [n, 2] to normalised display positions [n, 2]."""
     from_centre = normalized - parameters[:2]
     square = (from_centre**2).sum(axis=1, keepdims=True)
-    undistorted = (
-        from_centre / (1.0 + square * (parameters[2] + square * (parameters[3] + square * parameters[4])))
-        + parameters[:2]
-    )
+    stretch = 1.0 + square * (parameters[2] + square * (parameters[3] + square * parameters[4]))
+    undistorted = from_centre / stretch + parameters[:2]
     matrix = np.append(parameters[5:], 1.0).reshape(3, 3)
     projected = undistorted @ matrix[:, :2].T + matrix[:, 2]
     return np.asarray(projected[:, :2] / projected[:, 2:], dtype=np.float64)
@@ -253,11 +239,8 @@ def _map_to_display(normalized: FloatArray, parameters: FloatArray) -> FloatArra
 def _jacobian(normalized: FloatArray, parameters: FloatArray) -> FloatArray:
     """Return the derivatives of the map by its parameters, [n, 2, parameters]."""
     steps = DERIVATIVE_STEP * np.eye(len(parameters))
-    differences = [
-        _map_to_display(normalized, parameters + step) - _map_to_display(normalized, parameters - step)
-        for step in steps
-    ]
-    return np.stack(differences, axis=-1) / (2.0 * DERIVATIVE_STEP)
+    later, earlier = ([_map_to_display(normalized, parameters + sign * step) for step in steps] for sign in (1, -1))
+    return (np.stack(later, axis=-1) - np.stack(earlier, axis=-1)) / (2.0 * DERIVATIVE_STEP)
 
 
 def _calibrate_camera(
@@ -268,9 +251,8 @@ def _calibrate_camera(
     right, down = np.meshgrid(np.arange(columns), np.arange(rows))
     board = (pitch_m * np.stack([right, down, 0 * right], axis=-1).reshape(-1, 3)).astype(np.float32)
     views = [view.reshape(-1, 1, 2).astype(np.float32) for view in views_px]
-    residual_px, matrix, distortion, _, _ = import_opencv().calibrateCamera(
-        [board] * len(views), views, size, None, None
-    )
+    found = import_opencv().calibrateCamera([board] * len(views), views, size, None, None)
+    residual_px, matrix, distortion = found[:3]
     camera = np.asarray(matrix, dtype=np.float64), np.asarray(distortion, dtype=np.float64)
     return camera, float(residual_px) / np.sqrt(2.0)
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, ReadOnlyArrays
 from optodrive.lab.calibration.picture_plane import DisplayPlane, find_grid, fit_plane, grid_corners_m, orient_to_marks
 from optodrive.lab.calibration.pictures import Image, PictureFolder, PictureReader, import_opencv, read_picture_folder
 from optodrive.lab.calibration.spots import MeasuredSpots
@@ -68,17 +68,12 @@ def find_spot(where: str, picture: Image, background: Image) -> DetectedSpot:
     # The median removes hot pixels.
     smooth = cv2.GaussianBlur(cv2.medianBlur(light, 3), (0, 0), SMOOTHING_SIGMA_PX)
     smooth_noise = max(1.4826 * float(np.median(np.abs(smooth[::3, ::3]))), 0.2 * noise)
-    brightest = float(smooth.max())
-    if brightest < DETECTION_SNR_MIN * smooth_noise:
+    brightest, dimmest = float(smooth.max()), DETECTION_SNR_MIN * smooth_noise
+    if brightest < dimmest:
         found = f"nothing brighter than {brightest:.1f} counts above the background"
-        raise InputError(
-            where,
-            found,
-            f"a spot of at least {DETECTION_SNR_MIN * smooth_noise:.1f}, {DETECTION_SNR_MIN:g} times the noise",
-        )
-    labels, lights, centres_px = _find_blobs(
-        smooth, light, max(DETECTION_SNR_MIN * smooth_noise, BLOB_THRESHOLD_FRACTION * brightest)
-    )
+        expected = f"a spot of at least {dimmest:.1f}, {DETECTION_SNR_MIN:g} times the noise"
+        raise InputError(where, found, expected)
+    labels, lights, centres_px = _find_blobs(smooth, light, max(dimmest, BLOB_THRESHOLD_FRACTION * brightest))
     order = np.argsort(-lights)
     spot = int(order[0])
     rival_fraction = float(lights[order[1]] / lights[spot]) if len(order) > 1 else 0.0
@@ -94,19 +89,14 @@ def find_spot(where: str, picture: Image, background: Image) -> DetectedSpot:
     wide_px, wide_sigma_px = _compute_centroid(light, noise, centre_px, 2.0 * window)
     # A shift in a wider window beyond the noise indicates an asymmetric spot or stray light.
     asymmetry_px2 = max(0.0, float(((wide_px - centre_px) ** 2).mean()) - wide_sigma_px**2)
-    return DetectedSpot(
-        centre_px,
-        float(np.sqrt(noise_sigma_px**2 + asymmetry_px2)),
-        _count_saturated_pixels(picture, labels == spot + 1),
-        rival_fraction,
-    )
+    sigma_px = float(np.sqrt(noise_sigma_px**2 + asymmetry_px2))
+    return DetectedSpot(centre_px, sigma_px, _count_saturated_pixels(picture, labels == spot + 1), rival_fraction)
 
 
 def _find_blobs(smooth: Any, light: Any, level: float) -> tuple[Any, FloatArray, FloatArray]:
     """Return labels [rows, columns], and each blob's light (0 if it is small) and centre [n, 2], from label 1."""
-    count, labels, statistics, centres_px = import_opencv().connectedComponentsWithStats(
-        (smooth > level).astype(np.uint8)
-    )
+    found = import_opencv().connectedComponentsWithStats((smooth > level).astype(np.uint8))
+    count, labels, statistics, centres_px = found
     lights = np.bincount(labels.ravel(), weights=light.ravel().astype(np.float64), minlength=count)[1:]
     return labels, np.where(statistics[1:, -1] >= BLOB_AREA_MIN_PX, lights, 0.0), centres_px[1:]
 
@@ -122,25 +112,22 @@ def _fit_window(blob: Any, smooth: Any) -> FloatArray:
     y, x = np.nonzero(labels == labels[peak])
     moments = np.cov(np.stack([x, y]), bias=True) / CORE_MOMENT
     size, axes = np.linalg.eigh(moments)
-    window: FloatArray = (axes * np.maximum(size, WINDOW_SIGMA_MIN_PX**2)) @ axes.T
-    return window
+    return np.asarray((axes * np.maximum(size, WINDOW_SIGMA_MIN_PX**2)) @ axes.T, dtype=np.float64)
 
 
 def _check_edge(where: str, centre_px: FloatArray, window: FloatArray, shape: tuple[int, ...]) -> None:
     extent_px = 2.0 * np.sqrt(np.diag(window))
     if np.any(centre_px < extent_px) or np.any(centre_px > np.array(shape[::-1]) - 1.0 - extent_px):
-        raise InputError(
-            where, f"a spot at {centre_px[0]:.0f} {centre_px[1]:.0f} px, cut by the picture's edge", "the whole spot"
-        )
+        found = f"a spot at {centre_px[0]:.0f} {centre_px[1]:.0f} px, cut by the picture's edge"
+        raise InputError(where, found, "the whole spot")
 
 
 def _check_background(where: str, centre_px: FloatArray, window: FloatArray, background: Image, noise: float) -> None:
     """Refuse a spot on a pattern, as dark areas reflect less and bias the centre."""
     extent_px = int(np.ceil(2.0 * np.sqrt(np.linalg.eigvalsh(window)[-1])))
     x, y = np.rint(centre_px).astype(int)
-    dark, bright = np.percentile(
-        background[max(0, y - extent_px) : y + extent_px + 1, max(0, x - extent_px) : x + extent_px + 1], (5, 95)
-    )
+    rows, columns = (slice(max(0, at - extent_px), at + extent_px + 1) for at in (y, x))
+    dark, bright = np.percentile(background[rows, columns], (5, 95))
     if bright - dark > max(PATTERN_CONTRAST_MAX * bright, PATTERN_NOISE_FACTOR_MAX * noise):
         found = f"a spot at {x} {y} px on a pattern of {dark:.0f} to {bright:.0f} counts"
         raise InputError(where, found, "plain paper behind it, without the grid")
@@ -156,9 +143,8 @@ def _compute_centroid(light: Any, noise: float, start: FloatArray, window: Float
     extent_px = int(np.ceil(WINDOW_EXTENT_SIGMAS * np.sqrt(np.linalg.eigvalsh(window)[-1])))
     for _ in range(CENTROID_ITERATIONS_MAX):
         low = np.maximum(np.rint(centre_px).astype(int) - extent_px, 0)
-        part = light[
-            low[1] : int(np.rint(centre_px[1])) + extent_px + 1, low[0] : int(np.rint(centre_px[0])) + extent_px + 1
-        ]
+        end = np.rint(centre_px).astype(int) + extent_px + 1
+        part = light[low[1] : end[1], low[0] : end[0]]
         y, x = np.mgrid[low[1] : low[1] + part.shape[0], low[0] : low[0] + part.shape[1]]
         offset_px = np.stack([x - centre_px[0], y - centre_px[1]], axis=-1)
         distance2 = np.einsum("...a,ab,...b->...", offset_px, inverse, offset_px)
@@ -185,7 +171,7 @@ def _count_saturated_pixels(picture: Image, blob: Any) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraMeasurement:
+class CameraMeasurement(ReadOnlyArrays):
     """Spots measured from pictures.
 
     names: of the pictures, in the order of the spots; sigma_m: of each spot per axis, [n]
@@ -201,9 +187,6 @@ class CameraMeasurement:
     plane: DisplayPlane
     pixel_scale_m: float
     view_count: int
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
 
 def measure_folder(folder: Path) -> CameraMeasurement:
@@ -223,11 +206,8 @@ def _fit_grid_plane(pictures: PictureFolder, reader: PictureReader) -> DisplayPl
     plane = fit_plane(views, grid_corners_m(grid, origin), grid.pitch_m, (reader.columns, reader.rows))
     if plane.residual_px > CORNER_RESIDUAL_MAX_PX:
         found = f"corners {plane.residual_px:.2f} px off an even, flat grid, rms"
-        raise InputError(
-            str(pictures.grid_views[0]),
-            found,
-            f"at most {CORNER_RESIDUAL_MAX_PX:g} px: check that the grid is flat and in focus",
-        )
+        expected = f"at most {CORNER_RESIDUAL_MAX_PX:g} px: check that the grid is flat and in focus"
+        raise InputError(str(pictures.grid_views[0]), found, expected)
     return plane
 
 

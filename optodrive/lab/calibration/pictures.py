@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field as Item
 from pydantic import model_validator
 
-from optodrive.core.errors import MISSING, InputError
+from optodrive.core.errors import MISSING, InputError, refuse_os_error
 from optodrive.core.extras import import_extra
 from optodrive.core.numeric_tables import open_table
 from optodrive.core.plausibility import PlausibleRange, check_plausible
@@ -125,11 +125,8 @@ def read_picture_folder(folder: Path) -> PictureFolder:
         raise InputError(f"{path}: grid.pictures", len(content.grid.pictures), expected)
     views = tuple(_require_picture(folder, name, f"{path}: grid.pictures") for name in content.grid.pictures)
     dark = None if content.dark is None else _require_picture(folder, content.dark, f"{path}: dark")
-    rows = (
-        _list_by_table(folder, content.spots.table)
-        if content.spots.table
-        else _list_by_name(folder, path, content.spots)
-    )
+    table_name = content.spots.table
+    rows = _list_by_table(folder, table_name) if table_name else _list_by_name(folder, path, content.spots)
     return PictureFolder(path, content.grid, content.origin, views, dark, rows)
 
 
@@ -163,9 +160,8 @@ def _list_by_table(folder: Path, name: str) -> tuple[SpotPicture, ...]:
             where = f"{path}: row {line}"
             for column, code in zip(COLUMNS[1:], codes, strict=True):
                 _check_code(f"{where}: {column}", code)
-            pictures.append(
-                SpotPicture(_require_picture(folder, picture.strip(), f"{where}: file"), codes[0], codes[1])
-            )
+            file = _require_picture(folder, picture.strip(), f"{where}: file")
+            pictures.append(SpotPicture(file, codes[0], codes[1]))
     return tuple(pictures)
 
 
@@ -187,10 +183,8 @@ def read_image(path: Path) -> Image:
     Raises InputError if OpenCV cannot read it.
     """
     cv2 = import_opencv()
-    try:
+    with refuse_os_error(path, "a readable picture"):
         raw = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable picture") from None
     # Ignore the orientation tag: marks_px refer to the picture as the camera stored it.
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -227,15 +221,12 @@ class PictureReader:
         if pictures.dark is not None:
             return self(pictures.dark)
         if len(pictures.spot_pictures) < MEDIAN_PICTURES_MIN:
-            found = f"{len(pictures.spot_pictures)} spots"
-            raise InputError(
-                f"{pictures.path}: dark", MISSING, f"a picture without the beam, required with only {found}"
-            )
+            expected = f"a picture without the beam, required with only {len(pictures.spot_pictures)} spots"
+            raise InputError(f"{pictures.path}: dark", MISSING, expected)
         chosen = np.unique(np.linspace(0, len(pictures.spot_pictures) - 1, MEDIAN_PICTURES_MAX).astype(int))
         stack = np.stack([self(pictures.spot_pictures[at].path) for at in chosen])
         background: Image = np.empty_like(stack[0])
         for first in range(0, self.rows, MEDIAN_BLOCK_ROWS):
-            background[first : first + MEDIAN_BLOCK_ROWS] = np.median(
-                stack[:, first : first + MEDIAN_BLOCK_ROWS].astype(np.float32), axis=0
-            )
+            rows = slice(first, first + MEDIAN_BLOCK_ROWS)
+            background[rows] = np.median(stack[:, rows].astype(np.float32), axis=0)
         return background

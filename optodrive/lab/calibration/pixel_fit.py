@@ -153,47 +153,42 @@ class Optics:
         return min(self.offset_max_m[axis], self.absorber_half_m[axis] + 0.6 * self.focus_half_m[axis])
 
 
-@dataclass(frozen=True, eq=False)
-class _ResponseTable:
+class ResponseTable(NamedTuple):
     """Responses of one pixel as columns [k], aim_m [2, k]."""
 
     aim_m: FloatArray
     ratio: FloatArray
     sigma: FloatArray
 
-    def select(self, selected: BoolArray) -> "_ResponseTable":
-        return _ResponseTable(self.aim_m[:, selected], self.ratio[selected], self.sigma[selected])
+    @classmethod
+    def build(cls, responses: list[PixelResponse]) -> "ResponseTable":
+        """Tabulate responses."""
+        _, x_m, y_m, ratio, sigma = np.array(responses, dtype=np.float64).T
+        return cls(np.array([x_m, y_m]), ratio, sigma)
 
 
 def fit_pixel(responses: list[PixelResponse], optics: Optics) -> PixelEstimate:
     """Fit gain and offset of one pixel to its responses at any aims."""
     if not responses:
         return NO_ESTIMATE
-    table = _ResponseTable(
-        np.array([[item.aim_x_m for item in responses], [item.aim_y_m for item in responses]]),
-        np.array([item.ratio for item in responses]),
-        np.array([item.sigma for item in responses]),
-    )
+    table = ResponseTable.build(responses)
     if is_dead(table.ratio, table.sigma, select_centred(table.aim_m, optics)):
         return NO_ESTIMATE._replace(state=DEAD)
     is_offset_free = [_crosses_both_edges(table.aim_m[axis], optics, axis) for axis in range(2)]
     for axis in range(2):
         if not is_offset_free[axis]:  # the absorbed fraction of an aim near only one edge is unknown
-            table = table.select(optics.absorbed_fraction(axis, table.aim_m[axis]) == 1.0)
+            is_whole = optics.absorbed_fraction(axis, table.aim_m[axis]) == 1.0
+            table = ResponseTable(*(column[..., is_whole] for column in table))
     if not len(table.ratio):
         return NO_ESTIMATE
     gain, offset_m = _search_offsets(table, optics, is_offset_free)
     gain, offset_m, sigma = _fit_from(table, optics, is_offset_free, gain, offset_m)
     if not (sigma[0] <= GAIN_SIGMA_MAX and GAIN_MIN <= gain <= GAIN_MAX):
         return NO_ESTIMATE
-    is_offset_known = [
-        is_offset_free[axis]
-        and sigma[1 + axis] <= OFFSET_SIGMA_MAX_M
-        and abs(offset_m[axis]) < optics.search_range_m(axis)
-        for axis in range(2)
-    ]
-    x_m, y_m = (float(offset_m[axis]) if is_offset_known[axis] else 0.0 for axis in range(2))
-    x_sigma_m, y_sigma_m = (float(sigma[1 + axis]) if is_offset_known[axis] else float("nan") for axis in range(2))
+    ends_m = [optics.search_range_m(axis) for axis in range(2)]
+    is_known = np.array(is_offset_free) & (sigma[1:] <= OFFSET_SIGMA_MAX_M) & (np.abs(offset_m) < ends_m)
+    x_m, y_m = np.where(is_known, offset_m, 0.0).tolist()
+    x_sigma_m, y_sigma_m = np.where(is_known, sigma[1:], np.nan).tolist()
     return PixelEstimate(MEASURED, gain, float(sigma[0]), (x_m, y_m), (x_sigma_m, y_sigma_m))
 
 
@@ -229,16 +224,13 @@ def _crosses_both_edges(aim_m: FloatArray, optics: Optics, axis: int) -> bool:
     return bool(np.any(edge & (aim_m > 0)) and np.any(edge & (aim_m < 0)))
 
 
-def _search_offsets(table: _ResponseTable, optics: Optics, is_offset_free: list[bool]) -> tuple[float, FloatArray]:
+def _search_offsets(table: ResponseTable, optics: Optics, is_offset_free: list[bool]) -> tuple[float, FloatArray]:
     """Return gain and offset with the smallest chi-square on a grid of offsets."""
-    offsets_m = [
-        np.linspace(-1.0, 1.0, GRID_OFFSETS) * optics.search_range_m(axis) if is_offset_free[axis] else np.zeros(1)
-        for axis in range(2)
-    ]
-    x_fraction, y_fraction = (
-        optics.absorbed_fraction(axis, table.aim_m[axis] - offsets_m[axis][:, None]) for axis in range(2)
-    )
-    fraction = x_fraction[:, None] * y_fraction[None]
+    grid, offsets_m, fractions = np.linspace(-1.0, 1.0, GRID_OFFSETS), [], []
+    for axis in range(2):
+        offsets_m.append(grid * optics.search_range_m(axis) if is_offset_free[axis] else np.zeros(1))
+        fractions.append(optics.absorbed_fraction(axis, table.aim_m[axis] - offsets_m[axis][:, None]))
+    fraction = fractions[0][:, None] * fractions[1][None]
     weight = 1.0 / table.sigma**2
     gain = (fraction * weight * table.ratio).sum(-1) / np.maximum(1e-12, (fraction**2 * weight).sum(-1))
     chi2 = (weight * (table.ratio - gain[..., None] * fraction) ** 2).sum(-1)
@@ -247,7 +239,7 @@ def _search_offsets(table: _ResponseTable, optics: Optics, is_offset_free: list[
 
 
 def _fit_from(
-    table: _ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
+    table: ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return gain, offset and their standard errors [3], enlarged if the residuals exceed the stated sigmas."""
     from optodrive.lab.inference.fit import fit_residuals  # a sweep needs no scipy

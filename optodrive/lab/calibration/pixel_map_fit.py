@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.core.document import to_json
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import m_to_um
-from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import Run
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.pixel_map import DEAD, GAIN_MAX, GAIN_MIN, MEASURED, NOT_MEASURED, PixelMap
@@ -17,20 +17,16 @@ from optodrive.lab.calibration.pixel_fit import (
     Optics,
     PixelResponse,
     PredictHeights,
+    ResponseTable,
     compute_response,
     fit_pixel,
     select_centred,
     weighted_mean,
 )
+from optodrive.lab.calibration.spot_checks import UNIT_FACTORS
 
-UNIT_FACTORS = {
-    "millimetres": 1e3,
-    "micrometres": 1e6,
-    "centimetres": 1e2,
-    "inches": 1.0 / 0.0254,
-    "inches taken for millimetres, or the other way round": 25.4,
-}
-"""Units that are mistaken for metres, per metre."""
+RESPONSE_FACTORS = UNIT_FACTORS | {"inches taken for millimetres, or the other way round": 25.4}
+"""Errors of units, by the factor on a response."""
 UNIT_TOLERANCE = 1.2
 """Largest ratio, either way, of a display's typical gain to a unit's factor."""
 
@@ -39,12 +35,10 @@ def check_responses(where: str, by_pixel: dict[int, list[PixelResponse]], optics
     """Check that a display responds in metres and upwards. Raise InputError with the probable cause."""
     means = []
     for responses in by_pixel.values():
-        aim_m = np.array([[item.aim_x_m for item in responses], [item.aim_y_m for item in responses]])
-        is_centred = select_centred(aim_m, optics)
+        table = ResponseTable.build(responses)
+        is_centred = select_centred(table.aim_m, optics)
         if is_centred.any():
-            value = np.array([item.ratio for item in responses])[is_centred]
-            sigma = np.array([item.sigma for item in responses])[is_centred]
-            means.append(weighted_mean(value, sigma))
+            means.append(weighted_mean(table.ratio[is_centred], table.sigma[is_centred]))
     if not means:
         found = f"heights of {len(by_pixel)} pixels under light aimed at them"
         expected = "at least one run with pulses on the measured pixel and aim_x_m = aim_y_m = 0"
@@ -67,10 +61,10 @@ def check_responses(where: str, by_pixel: dict[int, list[PixelResponse]], optics
 
 
 def _guess_unit(ratio: float) -> str | None:
-    for name, factor in UNIT_FACTORS.items():
-        if factor / UNIT_TOLERANCE < ratio < factor * UNIT_TOLERANCE:
-            return name
-    return None
+    near = (
+        name for name, factor in RESPONSE_FACTORS.items() if factor / UNIT_TOLERANCE < ratio < factor * UNIT_TOLERANCE
+    )
+    return next(near, None)
 
 
 @dataclass
@@ -104,24 +98,14 @@ class PixelMapFitter:
         """Return the map. Raise InputError if the heights do not match a display of this model."""
         check_responses(where, self.by_pixel, self._optics)
         estimates = [fit_pixel(self.by_pixel.get(pixel, []), self._optics) for pixel in range(self._pixel_count)]
-        offset_m = np.array([found.offset_m for found in estimates]).T.copy()
-        sigma_m = np.array([found.offset_sigma_m for found in estimates]).T.copy()
-        return PixelMap(
-            gain=np.array([found.gain for found in estimates]),
-            gain_sigma=np.array([found.gain_sigma for found in estimates]),
-            offset_x_m=offset_m[0].copy(),
-            offset_y_m=offset_m[1].copy(),
-            offset_x_sigma_m=sigma_m[0].copy(),
-            offset_y_sigma_m=sigma_m[1].copy(),
-            state=np.array([found.state for found in estimates]),
-            model=model,
-        )
+        states, gains, gain_sigmas, offsets_m, offset_sigmas_m = map(np.array, zip(*estimates, strict=True))
+        x_m, y_m, x_sigma_m, y_sigma_m = (each.copy() for each in (*offsets_m.T, *offset_sigmas_m.T))
+        return PixelMap(gains, gain_sigmas, x_m, y_m, x_sigma_m, y_sigma_m, states, model)
 
 
 def compute_stats(pixel_map: PixelMap, runs: int) -> dict[str, Any]:
     """Return counts, extremes and each pixel's values, for --json."""
     measured = np.flatnonzero(pixel_map.state == MEASURED)
-    gain = pixel_map.gain[measured]
     columns: dict[str, FloatArray] = {"gain": pixel_map.gain, "gain_sigma": pixel_map.gain_sigma}
     for name in ("offset_x", "offset_x_sigma", "offset_y", "offset_y_sigma"):
         columns[f"{name}_um"] = m_to_um(getattr(pixel_map, f"{name}_m"))
@@ -131,16 +115,7 @@ def compute_stats(pixel_map: PixelMap, runs: int) -> dict[str, Any]:
         "measured": len(measured),
         "dead": np.flatnonzero(pixel_map.state == DEAD).tolist(),
         "not_measured": np.flatnonzero(pixel_map.state == NOT_MEASURED).tolist(),
-        "gain": None
-        if not len(measured)
-        else {
-            "median": float(np.median(gain)),
-            "min": float(gain.min()),
-            "min_pixel": int(measured[gain.argmin()]),
-            "max": float(gain.max()),
-            "max_pixel": int(measured[gain.argmax()]),
-            "sigma_median": float(np.median(pixel_map.gain_sigma[measured])),
-        },
+        "gain": _compute_gain_stats(pixel_map, measured) if len(measured) else None,
         "offset_um": {axis: _compute_offset_stats(pixel_map, axis) for axis in "xy"},
         "per_pixel": [
             {"pixel": pixel, "state": str(pixel_map.state[pixel])}
@@ -148,6 +123,15 @@ def compute_stats(pixel_map: PixelMap, runs: int) -> dict[str, Any]:
             for pixel in range(len(pixel_map))
         ],
     }
+
+
+def _compute_gain_stats(pixel_map: PixelMap, measured: IntArray) -> dict[str, float]:
+    gain = pixel_map.gain[measured]
+    ends = (("min", int(gain.argmin())), ("max", int(gain.argmax())))
+    stats = {"median": float(np.median(gain))}
+    for name, row in ends:
+        stats |= {name: float(gain[row]), f"{name}_pixel": int(measured[row])}
+    return stats | {"sigma_median": float(np.median(pixel_map.gain_sigma[measured]))}
 
 
 def _compute_offset_stats(pixel_map: PixelMap, axis: str) -> dict[str, Any] | None:

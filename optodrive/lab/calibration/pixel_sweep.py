@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, refuse_os_error
 from optodrive.core.types.arrays import BoolArray
 from optodrive.core.types.measurements import Measurement, Run
 from optodrive.core.types.stimuli import PulseTrain
@@ -65,12 +65,8 @@ def list_aims(config: Config) -> list[Aim]:
 
 def compute_pitch_min_m(config: Config, aims: list[Aim]) -> float:
     """Return the smallest pitch at which the focus stays in the pixel's cell at every aim, m."""
-    widths_m = [
-        2.0 * abs(offset_m) + focus_m
-        for aim in aims
-        for offset_m, focus_m in ((aim.x_m, config.laser.focus_width_m), (aim.y_m, config.laser.focus_height_m))
-    ]
-    return max(widths_m)
+    offset_m = np.abs([(aim.x_m, aim.y_m) for aim in aims])
+    return float((2.0 * offset_m + [config.laser.focus_width_m, config.laser.focus_height_m]).max())
 
 
 def compute_pulse(config: Config, aim: Aim) -> tuple[float, float]:
@@ -93,9 +89,8 @@ def edge_power_max_w(config: Config, width_s: float) -> float:
     """
     laser, limits = config.laser, config.limits
     headroom_k = WALL_HEADROOM_FRACTION * (limits.wall_max_c - config.ambient_c)
-    rise_k_per_w_s05 = 2.0 / (
-        ACRYLIC_EFFUSIVITY_W_S05_PER_M2_K * np.pi**0.5 * laser.focus_width_m * laser.focus_height_m
-    )
+    area_m2 = laser.focus_width_m * laser.focus_height_m
+    rise_k_per_w_s05 = 2.0 / (ACRYLIC_EFFUSIVITY_W_S05_PER_M2_K * np.pi**0.5 * area_m2)
     mean = rise_k_per_w_s05 * width_s**0.5
     ripple = rise_k_per_w_s05 * (laser.max_power_w / laser.pwm_hz) ** 0.5
     root = (-ripple + np.sqrt(ripple**2 + 4.0 * mean * headroom_k)) / (2.0 * mean)
@@ -164,7 +159,7 @@ class SweepJournal:
     def open(cls, path: Path, display: str) -> Self:
         """Open the journal of a display, or create it. Raise InputError for another display's or another file."""
         head = f"# optodrive sweep of {display}\n{HEADER}\n"
-        try:
+        with refuse_os_error(path, "a file that can be written"):
             text = path.read_text(encoding="utf-8") if path.exists() else ""
             complete = text[: text.rfind("\n") + 1] or head
             if not complete.startswith(head):
@@ -174,8 +169,6 @@ class SweepJournal:
             os.ftruncate(file, len(complete.encode()) if text else 0)
             if not text:
                 os.write(file, head.encode())
-        except OSError as error:
-            raise InputError(str(path), error.strerror, "a file that can be written") from None
         return cls(path, pulses, file)
 
     def list_done(self, aim: str) -> frozenset[int]:
@@ -221,20 +214,10 @@ def _parse_line(path: Path, number: int, line: str) -> SweepPulse:
 def build_runs(pulses: list[SweepPulse], aims: list[Aim], display: str, ambient_k: float) -> Measurement:
     """Build one run per pixel and aim, with its pulse at PRE_PULSE_S, to be merged with measured signals."""
     offsets = {aim.name: aim for aim in aims}
-    return Measurement(
-        tuple(
-            Run(
-                f"{pulse.aim}-{pulse.pixel:04d}",
-                ambient_k,
-                np.array([[PRE_PULSE_S, pulse.width_s, pulse.power_w, float(pulse.pixel)]]),
-                {},
-                {
-                    "aim_x_m": offsets[pulse.aim].x_m,
-                    "aim_y_m": offsets[pulse.aim].y_m,
-                    "display": display,
-                    "started_unix_s": pulse.start_unix_s - PRE_PULSE_S,
-                },
-            )
-            for pulse in pulses
-        )
-    )
+    runs = []
+    for pulse in pulses:
+        rows = np.array([[PRE_PULSE_S, pulse.width_s, pulse.power_w, float(pulse.pixel)]])
+        attributes: dict[str, str | float] = {"aim_x_m": offsets[pulse.aim].x_m, "aim_y_m": offsets[pulse.aim].y_m}
+        attributes |= {"display": display, "started_unix_s": pulse.start_unix_s - PRE_PULSE_S}
+        runs.append(Run(f"{pulse.aim}-{pulse.pixel:04d}", ambient_k, rows, {}, attributes))
+    return Measurement(tuple(runs))

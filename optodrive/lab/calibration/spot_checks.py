@@ -62,9 +62,8 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
     codes = np.column_stack([spots.x_code, spots.y_code])
     widths = np.linalg.svd(codes - codes.mean(axis=0), compute_uv=False)
     if widths[0] == 0.0:
-        raise InputError(
-            f"{where}: x_code, y_code", codes[0].tolist(), "several places, but all spots have the same codes"
-        )
+        expected = "several places, but all spots have the same codes"
+        raise InputError(f"{where}: x_code, y_code", codes[0].tolist(), expected)
     if widths[1] < COLLINEARITY_RATIO_MIN * widths[0]:
         found = f"all on a line, {widths[1] / widths[0]:.1%} as wide as long"
         raise InputError(f"{where}: x_code, y_code", found, "spots over the whole field")
@@ -83,9 +82,8 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
     if float(np.hypot(*shift)) > SHIFT_MAX_M:
         _check_row_lag(where, commanded_m, measured_m)
         found = f"{shift[0] * 1e3:.1f}, {shift[1] * 1e3:.1f} mm with both mirrors in the middle position"
-        raise InputError(
-            f"{where}: x_m, y_m", found, f"the display's middle within {format_quantity(SHIFT_MAX_M, 'm')} of the beam"
-        )
+        expected = f"the display's middle within {format_quantity(SHIFT_MAX_M, 'm')} of the beam"
+        raise InputError(f"{where}: x_m, y_m", found, expected)
 
 
 def check_fit(where: str, fit: FieldFit) -> None:
@@ -113,9 +111,8 @@ def _check_row_lag(where: str, commanded_m: FloatArray, measured_m: FloatArray) 
     """Raise InputError for positions that an affine map fits better, and at the middle, one row above or below."""
     if len(commanded_m) <= SPOTS_MIN:
         return
-    found = {
-        lag: _mean_deviation_m(_shift_rows(commanded_m, lag), _shift_rows(measured_m, -lag)) for lag in (0, *ROW_LAGS)
-    }
+    shifted = ((lag, _shift_rows(commanded_m, lag), _shift_rows(measured_m, -lag)) for lag in (0, *ROW_LAGS))
+    found = {lag: _mean_deviation_m(commanded, measured) for lag, commanded, measured in shifted}
     best = min(found, key=lambda lag: found[lag][0])
     if best and found[best][1] < SHIFT_MAX_M:
         raise _lag_error(where, best)
@@ -188,11 +185,8 @@ def _check_scale(where: str, scale: float) -> None:
         if abs(scale / factor - 1.0) < SCALE_TOLERANCE:
             raise InputError(f"{where}: x_m, y_m", f"values that look like {unit}", "metres")
     if abs(scale - 1.0) > SCALE_TOLERANCE:
-        raise InputError(
-            f"{where}: x_m, y_m",
-            f"distances {scale:.3g} × the commanded ones",
-            f"1 ± {SCALE_TOLERANCE:g}; scanner.focal_length_m and range_rad determine the commanded distances",
-        )
+        expected = f"1 ± {SCALE_TOLERANCE:g}; scanner.focal_length_m and range_rad determine the commanded distances"
+        raise InputError(f"{where}: x_m, y_m", f"distances {scale:.3g} × the commanded ones", expected)
 
 
 def _check_axes(where: str, directions: FloatArray, wiring: Wiring) -> None:
@@ -209,11 +203,8 @@ def _check_axes(where: str, directions: FloatArray, wiring: Wiring) -> None:
         raise InputError(f"{where}: x_m, y_m", AXIS_ERRORS[nearest], expected)
     turn_rad = float(np.arctan2(directions[1, 0] - directions[0, 1], directions[0, 0] + directions[1, 1]))
     if abs(turn_rad) > TURN_MAX_RAD:
-        raise InputError(
-            f"{where}: x_m, y_m",
-            f"a display turned by {degrees(turn_rad):.1f}°",
-            f"at most {degrees(TURN_MAX_RAD):.0f}°",
-        )
+        found = f"a display turned by {degrees(turn_rad):.1f}°"
+        raise InputError(f"{where}: x_m, y_m", found, f"at most {degrees(TURN_MAX_RAD):.0f}°")
 
 
 def _correct_wiring(directions: IntArray, wiring: Wiring) -> Wiring:

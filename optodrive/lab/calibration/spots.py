@@ -12,7 +12,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.numeric_tables import read_columns, read_comments, write_columns
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, ReadOnlyArrays
 from optodrive.device.calibrated_field import Extent
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_sections import DIRECT_WIRING, Wiring
@@ -32,16 +32,13 @@ SURFACE_RMS_M = 12e-6
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredSpots:
+class MeasuredSpots(ReadOnlyArrays):
     """Codes of the converter, and positions of the beam on the display, m, all [n]."""
 
     x_code: FloatArray
     y_code: FloatArray
     x_m: FloatArray
     y_m: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.x_code)
@@ -69,30 +66,22 @@ def read_spots(path: Path, display: str = "") -> MeasuredSpots:
         raise InputError(f"{path}: spots", f"those of {named}", f"those of {display}, the configured display")
     if len(table) and np.all(np.abs(table[:, :2]) < 1.0) and np.any(table[:, :2]):
         swapped = np.abs(table[:, 2:]).max() > 100.0
-        raise InputError(
-            f"{path}: x_code, y_code",
-            float(table[0, 0]),
-            "codes of the converter, 0 to 65535; these look like metres"
-            + (", with the columns of codes and of metres exchanged" if swapped else ""),
-        )
+        hint = ", with the columns of codes and of metres exchanged" if swapped else ""
+        expected = f"codes of the converter, 0 to 65535; these look like metres{hint}"
+        raise InputError(f"{path}: x_code, y_code", float(table[0, 0]), expected)
     bad = np.argwhere((table[:, :2] < 0) | (table[:, :2] > CODE_MAX))
     if len(bad):
         row, column = bad[0].tolist()
-        raise InputError(
-            f"{path}: row {row + find_first_line(path)}: {COLUMNS[column]}",
-            float(table[row, column]),
-            f"0 to {CODE_MAX}",
-        )
+        place = f"{path}: row {row + find_first_line(path)}: {COLUMNS[column]}"
+        raise InputError(place, float(table[row, column]), f"0 to {CODE_MAX}")
     _, first, copies = np.unique(table, axis=0, return_index=True, return_inverse=True)
     original = first[copies.ravel()]
     repeated = np.flatnonzero(original != np.arange(len(table)))
     if len(repeated):
         row, line = int(repeated[0]), find_first_line(path)
-        raise InputError(
-            f"{path}: row {row + line}",
-            Unquoted(f"the numbers of row {original[row] + line}, as {len(repeated)} rows in all repeat others"),
-            "each measurement once: copies would make the field look more certain than it is",
-        )
+        found = f"the numbers of row {original[row] + line}, as {len(repeated)} rows in all repeat others"
+        expected = "each measurement once: copies would make the field look more certain than it is"
+        raise InputError(f"{path}: row {row + line}", Unquoted(found), expected)
     return MeasuredSpots.from_table(table)
 
 
@@ -110,7 +99,7 @@ def write_spots(path: Path, spots: MeasuredSpots, display: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class FieldPrior:
+class FieldPrior(ReadOnlyArrays):
     """Prior distribution of a field's parameters.
 
     mean, sigma: of each parameter of the geometry; extent: codes of the field; display_extent: codes of the display
@@ -130,9 +119,6 @@ class FieldPrior:
     display: str = ""
     wiring: Wiring = DIRECT_WIRING
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
     @classmethod
     def from_config(cls, config: Config) -> Self:
         """Build the prior from a configuration's nominal values and the tolerances of an ordinary laboratory."""
@@ -143,25 +129,21 @@ class FieldPrior:
         edge_rad = float(np.hypot(half_m[0], half_m[1])) / focal_m
         code_m = 2.0 * focal_m * scanner.rad_per_code
         x_half, y_half = (min(half / code_m, float(CODE_MAX - CENTRE_CODE)) for half in half_m)
-        tolerances = {
-            "gain_x": (1.0, 0.01),
-            "gain_y": (1.0, 0.01),
-            "offset_x_rad": (0.0, 2e-3),
-            "offset_y_rad": (0.0, 2e-3),
-            "cross_x": (0.0, 5e-3),
-            "cross_y": (0.0, 5e-3),
-            "cubic_x_per_rad2": (0.0, 2e-3 / range_rad**2),
-            "cubic_y_per_rad2": (0.0, 2e-3 / range_rad**2),
+        of_axes = {
+            "gain_{}": (1.0, 0.01),
+            "offset_{}_rad": (0.0, 2e-3),
+            "cross_{}": (0.0, 5e-3),
+            "cubic_{}_per_rad2": (0.0, 2e-3 / range_rad**2),
+            "shift_{}_m": (0.0, 2e-3),
+            "tilt_{}_rad": (0.0, 0.015),
+        }
+        tolerances = {name.format(axis): each for name, each in of_axes.items() for axis in "xy"} | {
             "mirror_distance_m": (14e-3, 4e-3),
             "lens_distance_m": (45e-3, 12e-3),
             "focal_length_m": (focal_m, 0.005 * focal_m),
             "distortion3_per_rad2": (0.0, 3e-3 / edge_rad**2),
             "distortion5_per_rad4": (0.0, 1e-3 / edge_rad**4),
-            "shift_x_m": (0.0, 2e-3),
-            "shift_y_m": (0.0, 2e-3),
             "turn_rad": (0.0, 0.03),
-            "tilt_x_rad": (0.0, 0.015),
-            "tilt_y_rad": (0.0, 0.015),
         }
         return cls(
             mean=FieldGeometry(**{name: mean for name, (mean, _) in tolerances.items()}),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.errors import InputError, LinkError
-from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, IntArray, ReadOnlyArrays
 from optodrive.core.types.plans import PulsePlan
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, find_weakest_pixel, max_settling_s
 from optodrive.link.protocol.quantisation import CENTRE_CODE, GATE_OFF_STEP_TICKS, TICKS_MAX, WirePoints, WireScale
@@ -31,7 +31,7 @@ HOLD_GROWTH = 1.25
 
 
 @dataclass(frozen=True, eq=False)
-class StepRun:
+class StepRun(ReadOnlyArrays):
     """Steps of one size.
 
     codes: [n, 2] of x and y, the first before any step
@@ -41,9 +41,6 @@ class StepRun:
     name: str
     codes: IntArray
     hold_ticks: IntArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
 
 def plan_step_runs(board: ExclusiveBoard, step_count: int) -> tuple[StepRun, ...]:

@@ -7,7 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, list_names
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import (
     CandidateCause,
@@ -67,7 +67,6 @@ from optodrive.lab.diagnosis.recording_checks import check_copied_runs, check_nu
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_strongest
 from optodrive.lab.inference.claim import HeldOutChange, claim, combine_claims
 from optodrive.lab.inspection.inspection import inspect_recording
-from optodrive.lab.inspection.work import list_names
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.term import BySignal, TermValues
 from optodrive.physics.terms import discover_terms

@@ -11,7 +11,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import RECORDING
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, list_names
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.measurements import DataFinding, Measurement, Signal
 from optodrive.lab.inspection.repeat_faults import SAME_PHASE, find_gains, find_lost, find_noisy, find_outliers
@@ -38,7 +38,6 @@ from optodrive.lab.inspection.work import (
     describe_extent,
     find_unit,
     format_span,
-    list_names,
     select_finite,
 )
 
@@ -79,10 +78,8 @@ class Inspection:
             if item.action == "refused":
                 where = f"recording: {list_names(item.runs)}: {item.kind}"
                 raise InputError(where, Unquoted("what cannot be used"), item.text.rstrip("."))
-        is_empty = not any(
-            np.isfinite(signal.value).any() for run in self.measurement.runs for signal in run.signals.values()
-        )
-        if self.omitted and is_empty:
+        values = (signal.value for run in self.measurement.runs for signal in run.signals.values())
+        if self.omitted and not any(np.isfinite(value).any() for value in values):
             reason = self.omitted[-1].text.removesuffix("; left out.")
             raise InputError("recording", Unquoted("no signal that can be used"), f"at least one; {reason}")
 
@@ -206,14 +203,10 @@ def _note_sampling(work: Work, name: str) -> Found:
 
 
 def _has_other_phase(work: Work, run: int, name: str, signal: Signal) -> bool:
-    others = [work.signals.get((other, name)) for other in work.find_repeats(run)]
+    others = [work.signals[other, name] for other in work.find_repeats(run) if (other, name) in work.signals]
     interval_s = float(np.median(np.diff(signal.t_s)))
-    return any(
-        other is not None
-        and abs((other.t_s[0] - signal.t_s[0] + 0.5 * interval_s) % interval_s - 0.5 * interval_s)
-        > SAME_PHASE * interval_s
-        for other in others
-    )
+    shifts_s = [float(other.t_s[0] - signal.t_s[0]) + 0.5 * interval_s for other in others]
+    return any(abs(shift_s % interval_s - 0.5 * interval_s) > SAME_PHASE * interval_s for shift_s in shifts_s)
 
 
 def _note_noise(work: Work, name: str) -> Found:

@@ -3,8 +3,9 @@
 from typing import Any
 
 from optodrive.core.document import Markup, Section, Table, to_json
+from optodrive.core.quantity import list_names
 from optodrive.core.types.measurements import DataFinding
-from optodrive.lab.inspection.work import count, list_names
+from optodrive.lab.inspection.work import count
 
 ACTIONS = {"refused": 0, "left out": 1, "noted": 2}
 NOTHING = "Nothing is left out."

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, list_names
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.measurements import Run
 from optodrive.lab.inspection.response_faults import (
@@ -23,7 +23,7 @@ from optodrive.lab.inspection.response_faults import (
     measure_time_constant,
 )
 from optodrive.lab.inspection.signal_faults import find_outlier_candidates, measure_deviation, measure_noise
-from optodrive.lab.inspection.work import Found, Work, describe_extent, list_names, measures_alike, select_finite
+from optodrive.lab.inspection.work import Found, Work, describe_extent, measures_alike, select_finite
 
 NOISIER = 4.0
 """Noise of a run relative to that of all runs, and to its quietest repeat's, from which the signal is left out."""
@@ -95,12 +95,8 @@ def find_lost(work: Work, _: str) -> Found:
         all_of = {run: next(own[run] for own in found.values() if run in own) for run in runs if runs.count(run) > 1}
         off = {run: item for run, item in (all_of | early).items() if (run, name) in work.signals}
         if off:
-            shown = list_names(
-                [
-                    f"{work.runs[n].name} (by {format_quantity(s, 's', 2)} from {t:.3g} s on)"
-                    for n, (t, s) in off.items()
-                ]
-            )
+            early_runs = ((work.runs[run].name, format_quantity(by_s, "s", 2), t_s) for run, (t_s, by_s) in off.items())
+            shown = list_names([f"{run} (by {by} from {t_s:.3g} s on)" for run, by, t_s in early_runs])
             text = f"{name} of {shown} is earlier than in repeats: samples were lost, or trigger or clock are off"
             yield work.drop(name, off), text
 
@@ -111,20 +107,11 @@ def _list_early(work: Work, name: str) -> dict[int, tuple[float, float]]:
     lost: dict[int, tuple[float, float]] = {}
     for number, share in shares.items():
         same = work.runs[number]  # groups of equal light tell more together
-        repeats = [
-            run
-            for run in shares
-            if run != number
-            and np.array_equal(work.runs[run].pulses, same.pulses)
-            and measures_alike(work.runs[run], same)
-        ]
+        alike = [run for run in shares if run != number and np.array_equal(work.runs[run].pulses, same.pulses)]
+        repeats = [run for run in alike if measures_alike(work.runs[run], same)]
         own = select_finite(work.signals[number, name])
-        found = [
-            early
-            for other in repeats
-            if shares[other] > share
-            and (early := _find_early(*own, *select_finite(work.signals[other, name]))) is not None
-        ]
+        better = [select_finite(work.signals[other, name]) for other in repeats if shares[other] > share]
+        found = [early for other in better if (early := _find_early(*own, *other)) is not None]
         if 2 * len(found) > len(repeats):
             lost[number] = found[0]
     return lost

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, list_names
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import DataFinding, Signal
-from optodrive.lab.inspection.work import Found, Step, Work, count, list_names
+from optodrive.lab.inspection.work import Found, Step, Work, count
 
 TAUS_S = (0.003, 0.0045, 0.0065, 0.009, 0.013, 0.018, 0.026, 0.037, 0.052, 0.1)
 SECOND_S = 0.003
@@ -250,14 +250,13 @@ def _find_late_s(left: FloatArray, around_s: float) -> float:
     """Return the shift that leaves least, s, if it leaves far less than those around one, else that one."""
     at = int(np.argmin(left))
     is_near = np.abs(SHIFTS_S - around_s) < MIN_SHIFT_S
-    is_off = (
-        not is_near[at] and left[at] < 1.0 - SHIFT_EXPLAINS and left[at] < SHIFT_LEAVES * float(left[is_near].min())
-    )
+    limit = min(1.0 - SHIFT_EXPLAINS, SHIFT_LEAVES * float(left[is_near].min()))
+    is_off = not is_near[at] and left[at] < limit
     return float(SHIFTS_S[at]) if is_off else around_s
 
 
 def _find_shifts_of(work: Work, name: str) -> tuple[float, dict[int, float]]:
-    """Return by how much a signal is late in most runs, s, and by how much in the runs that differ from these."""
+    """Return by how much a signal is late in limit runs, s, and by how much in the runs that differ from these."""
     shares = [item.share for item in measure_responses(work, name)]
     if not shares or min(shares) > FITS_UNSHIFTED:
         return 0.0, {}
@@ -306,10 +305,8 @@ def _find_shifts(work: Work, _: str) -> Found:
         own = {number: common_s for number, _ in work.list_signals(name)} if common_s else others | differing
         if own:
             shift = _describe_shift(float(np.median(list(own.values()))))
-            yield (
-                work.drop(name, own),
-                f"{name} of {work.list_runs(own)} responds {shift} the light: the trigger or the clock is off",
-            )
+            text = f"{name} of {work.list_runs(own)} responds {shift} the light: the trigger or the clock is off"
+            yield work.drop(name, own), text
 
 
 def _describe_shift(late_s: float) -> str:

@@ -91,10 +91,8 @@ def _fit_bend(members: list[_Means], name: str, value: FloatArray, *, is_own: bo
     """Return the best bend, at a value of all runs, or at a share of each run's own largest response."""
     y, best = value - value.mean(), _Bend(np.inf, 1.0, 1.0, 0.0, value)
     for tau_s in BEND_TAUS_S:
-        own = [
-            compute_template(pulses, t_s, tau_s, get_second_s(name)).reshape(-1, size).mean(axis=1)
-            for pulses, t_s, size, _ in members
-        ]
+        templates = ((compute_template(pulses, t_s, tau_s, get_second_s(name)), n) for pulses, t_s, n, _ in members)
+        own = [template.reshape(-1, size).mean(axis=1) for template, size in templates]
         x = np.concatenate(own)
         x /= max(float(x.max()), 1e-300)
         scale = np.concatenate([np.full(len(item), item.max()) for item in own]) if is_own else np.ones(len(x))

@@ -145,9 +145,8 @@ def _combine(runs: tuple[Run, ...], stamps: list[_Stamp]) -> StartTimes:
         return _refuse(repeated, f"{shown!r} {text}")
     times_s = np.array(seconds)
     if zones[0] is None and _is_set_back(whens):
-        return _refuse(
-            runs, "goes back within an hour on a Sunday in autumn and states no zone; state the offset, +01:00."
-        )
+        text = "goes back within an hour on a Sunday in autumn and states no zone; state the offset, +01:00."
+        return _refuse(runs, text)
     resolution_s = 1.0 if all(stamp.has_seconds for stamp in stamps) else 60.0
     said = []
     if open_runs:
@@ -164,12 +163,8 @@ def _is_set_back(whens: list[datetime]) -> bool:
     """Return whether times in the order of the runs step back once, as clocks do on a Sunday in autumn."""
     steps_s = [(later - earlier).total_seconds() for earlier, later in itertools.pairwise(whens)]
     back = [at for at, step_s in enumerate(steps_s) if step_s < 0.0]
-    return (
-        len(back) == 1
-        and steps_s[back[0]] > -HOUR_S
-        and whens[back[0]].weekday() == SUNDAY
-        and whens[back[0]].month in (10, 11)
-    )
+    is_once = len(back) == 1 and steps_s[back[0]] > -HOUR_S
+    return is_once and whens[back[0]].weekday() == SUNDAY and whens[back[0]].month in (10, 11)
 
 
 def _examine(runs: tuple[Run, ...], seconds: FloatArray, resolution_s: float) -> tuple[DataFinding, ...]:

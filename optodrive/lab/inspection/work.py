@@ -6,11 +6,10 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, list_names
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.measurements import DataFinding, Measurement, Run, Signal
 
-MAX_NAMES = 4
 Known = TypeVar("Known")
 
 
@@ -46,9 +45,8 @@ class Work:
 
     def __init__(self, measurement: Measurement) -> None:
         self.runs: tuple[Run, ...] = measurement.runs
-        self.signals = {
-            (number, name): signal for number, run in enumerate(self.runs) for name, signal in run.signals.items()
-        }
+        numbered = ((number, *item) for number, run in enumerate(self.runs) for item in run.signals.items())
+        self.signals = {(number, name): signal for number, name, signal in numbered}
         self._known: dict[object, Any] = {}
         self._repeats: dict[int, list[int]] = {}
 
@@ -103,12 +101,11 @@ class Work:
 
     def build(self) -> Measurement:
         """Return the recording as it is left. Runs without signals stay, for their light."""
-        return Measurement(
-            tuple(
-                replace(run, signals={name: self.signals[n, name] for name in run.signals if (n, name) in self.signals})
-                for n, run in enumerate(self.runs)
-            )
-        )
+        runs = []
+        for n, run in enumerate(self.runs):
+            signals = {name: self.signals[n, name] for name in run.signals if (n, name) in self.signals}
+            runs.append(replace(run, signals=signals))
+        return Measurement(tuple(runs))
 
     def find_repeats(self, run: int) -> list[int]:
         """Return the other runs of a run's group that measure its pixels, or with equal light if it states none."""
@@ -124,15 +121,11 @@ class Work:
             if group is not None:
                 return other.attributes.get("group") == group
             is_same = other.pulses.shape == own.pulses.shape and np.allclose(other.pulses, own.pulses, 1e-6, 1e-6)
-            return (
-                other.attributes.get("group") is None and is_same and (other.commands is None) == (own.commands is None)
-            )
+            is_grouped = other.attributes.get("group") is not None
+            return not is_grouped and is_same and (other.commands is None) == (own.commands is None)
 
-        return [
-            number
-            for number, other in enumerate(self.runs)
-            if number != run and is_repeat(other) and measures_alike(own, other)
-        ]
+        others = ((number, other) for number, other in enumerate(self.runs) if number != run)
+        return [number for number, other in others if is_repeat(other) and measures_alike(own, other)]
 
 
 def measures_alike(own: Run, other: Run) -> bool:
@@ -149,12 +142,6 @@ def select_finite(signal: Signal) -> tuple[FloatArray, FloatArray]:
 def find_unit(name: str) -> str:
     """Return the unit in a signal's name."""
     return name.rsplit("_", 1)[1]
-
-
-def list_names(names: tuple[str, ...] | list[str], max_names: int = MAX_NAMES) -> str:
-    """Return names as text, the first ones of many."""
-    shown = ", ".join(names[:max_names])
-    return shown if len(names) <= max_names else f"{shown} and {len(names) - max_names} more"
 
 
 def count_samples(edits: list[Edit]) -> int:

@@ -1,5 +1,6 @@
 """Validity checks of a recording that raise InputError with the place of the violation."""
 
+from collections.abc import Iterable
 from difflib import get_close_matches
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from optodrive.core.errors import MISSING, InputError, Unquoted, suggest_nearest
 from optodrive.core.plausibility import RECORDING, guess_unit
 from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.measurements import Run
 from optodrive.lab.recording.storage import (
     COMMANDS,
     FORMAT,
@@ -77,20 +79,16 @@ def select_signals(place: str, members: list[str]) -> list[str]:
     """Return the signals of a run in the format's order after checking that its members are known and complete."""
     for member in members:
         if member not in RUN_MEMBERS:
-            raise InputError(
-                f"{place}/{format_name(member)}",
-                Unquoted("an unknown name or unit"),
-                suggest_nearest(member, list(RUN_MEMBERS)),
-            )
+            expected = suggest_nearest(member, list(RUN_MEMBERS))
+            raise InputError(f"{place}/{format_name(member)}", Unquoted("an unknown name or unit"), expected)
     if PULSES not in members:
         raise InputError(f"{place}/{PULSES}", MISSING, f"one row per pulse: {', '.join(TABLE_COLUMNS[PULSES])}")
     signals = [name for name in SIGNALS if name in members]
     if not signals:
         raise InputError(place, Unquoted("a run without signals"), f"at least one of {', '.join(SIGNALS)}")
     if COMMANDS not in members and set(signals) & set(MIRROR_SIGNALS):
-        raise InputError(
-            f"{place}/{COMMANDS}", MISSING, f"the commanded mirror angles: {', '.join(TABLE_COLUMNS[COMMANDS])}"
-        )
+        expected = f"the commanded mirror angles: {', '.join(TABLE_COLUMNS[COMMANDS])}"
+        raise InputError(f"{place}/{COMMANDS}", MISSING, expected)
     return signals
 
 
@@ -118,12 +116,10 @@ def _check_no_overlap(place: str, pulses: FloatArray) -> None:
             longest = int(np.argmax(pulses[:, 1]))
             expected = "pulses in s that do not overlap; these widths are likely in ms"
             raise InputError(f"{place}[{longest}]: width_s", float(pulses[longest, 1]), expected, "unit")
-        first = int(overlapping[0])
-        raise InputError(
-            f"{place}[{order[first + 1]}]: start_s",
-            float(start_s[first + 1]),
-            f"at least {float(end_s[first])!r}, the end of the previous pulse: the beam addresses one pixel at a time",
-        )
+        row = int(overlapping[0]) + 1
+        end = f"{float(end_s[row - 1])!r}, the end of the previous pulse"
+        expected = f"at least {end}: the beam addresses one pixel at a time"
+        raise InputError(f"{place}[{order[row]}]: start_s", float(start_s[row]), expected)
 
 
 def check_commands(place: str, commands: FloatArray) -> None:
@@ -149,9 +145,8 @@ def parse_pixel(place: str, signal: str, attributes: Attributes) -> int:
     if value is None and signal in MIRROR_SIGNALS:
         return 0
     if value is None or isinstance(value, str) or not (0 <= value <= PIXEL_MAX and value == int(value)):
-        raise InputError(
-            f"{place}: pixel", value, f"the index of the pixel measured, a whole number from 0 to {PIXEL_MAX}"
-        )
+        expected = f"the index of the pixel measured, a whole number from 0 to {PIXEL_MAX}"
+        raise InputError(f"{place}: pixel", value, expected)
     return int(value)
 
 
@@ -161,9 +156,8 @@ def parse_sigma(place: str, attributes: Attributes) -> float | None:
     if value is None or value == 0:
         return None
     if isinstance(value, str) or not 0 < value < np.inf:
-        raise InputError(
-            f"{place}: sigma", value, "the instrument's noise: a positive number in the unit of the signal"
-        )
+        expected = "the instrument's noise: a positive number in the unit of the signal"
+        raise InputError(f"{place}: sigma", value, expected)
     return float(value)
 
 
@@ -171,19 +165,16 @@ def check_unit(place: str, signal: str, attributes: Attributes) -> None:
     """Check that a unit attribute, if present, agrees with the unit in the signal's name."""
     for field in ("unit", "units"):
         if attributes.get(field, UNITS[signal]) != UNITS[signal]:
-            raise InputError(
-                f"{place}: {field}", attributes[field], f"'{UNITS[signal]}', as stated in the signal's name"
-            )
+            expected = f"'{UNITS[signal]}', as stated in the signal's name"
+            raise InputError(f"{place}: {field}", attributes[field], expected)
 
 
-def check_sample_count(place: str, finite: int) -> None:
+def check_sample_count(place: str, runs: Iterable[Run]) -> None:
     """Check that there are at least as many finite samples as the nominal model has parameters."""
+    finite = sum(int(np.isfinite(signal.value).sum()) for run in runs for signal in run.signals.values())
     if finite < MODEL_PARAMETER_COUNT:
-        raise InputError(
-            place,
-            Unquoted(f"{finite} finite samples"),
-            f"at least {MODEL_PARAMETER_COUNT}, the number of model parameters",
-        )
+        expected = f"at least {MODEL_PARAMETER_COUNT}, the number of model parameters"
+        raise InputError(place, Unquoted(f"{finite} finite samples"), expected)
 
 
 def _check_finite(place: str, table: FloatArray, columns: tuple[str, ...]) -> None:

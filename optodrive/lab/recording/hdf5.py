@@ -128,12 +128,10 @@ class Hdf5Tree(RecordingTree):
 
     def read_samples(self, run: str, signal: str) -> tuple[FloatArray, FloatArray]:
         """Return the times and values of a signal."""
-        t_s, value = self._open_series(run, signal)
+        series = zip(SAMPLE_COLUMNS, self._open_series(run, signal), strict=True)
         with convert_errors(self.format_place(run, signal), "readable data"):
-            return (
-                self._read_numbers(self.format_place(run, signal, "t_s"), t_s),
-                self._read_numbers(self.format_place(run, signal, "value"), value),
-            )
+            t_s, value = (self._read_numbers(self.format_place(run, signal, name), data) for name, data in series)
+            return t_s, value
 
     def count_samples(self, run: str, signal: str) -> int:
         """Return the number of samples of a signal."""
@@ -151,11 +149,8 @@ class Hdf5Tree(RecordingTree):
         group = self._open_run(run, signal)
         t_s, value = (self._open_dataset(self.format_place(run, signal, name), group, name) for name in SAMPLE_COLUMNS)
         if len(t_s.shape) != 1:
-            raise InputError(
-                self.format_place(run, signal, "t_s"),
-                Unquoted(f"the shape {t_s.shape}"),
-                "a one-dimensional array of times",
-            )
+            place = self.format_place(run, signal, "t_s")
+            raise InputError(place, Unquoted(f"the shape {t_s.shape}"), "a one-dimensional array of times")
         if value.shape != t_s.shape:
             expected = f"as many values as times, {t_s.shape}"
             raise InputError(self.format_place(run, signal, "value"), Unquoted(f"the shape {value.shape}"), expected)
@@ -169,13 +164,12 @@ class Hdf5Tree(RecordingTree):
         with convert_errors(place, "a readable group"):
             names, addresses = [], set()
             for name in group:
+                own = f"{place}/{format_name(name)}"
                 link = group.id.links.get_info(name.encode("utf-8", "surrogateescape"))
                 if link.type != self._h5.h5l.TYPE_HARD:
-                    raise InputError(f"{place}/{format_name(name)}", Unquoted("a link"), "a group, stored in this file")
+                    raise InputError(own, Unquoted("a link"), "a group, stored in this file")
                 if link.u in addresses:
-                    raise InputError(
-                        f"{place}/{format_name(name)}", Unquoted("a second name of a group"), "one name of each"
-                    )
+                    raise InputError(own, Unquoted("a second name of a group"), "one name of each")
                 addresses.add(link.u)
                 names.append(name)
             return names
@@ -287,9 +281,8 @@ def probe_in_sandbox(path: Path) -> None:
         raise InputError(str(path), Unquoted("damage on which the HDF5 library hangs or crashes"), "an undamaged file")
     if returncode > 0:  # Python itself reported it, such as a lack of memory: the file need not be the cause
         reason = " ".join(error_lines[-1:])[:ERROR_CHARACTERS_MAX]
-        raise InputError(
-            str(path), Unquoted(f"a file that could not be tried out ({reason})"), "a process that reads it"
-        )
+        found = f"a file that could not be tried out ({reason})"
+        raise InputError(str(path), Unquoted(found), "a process that reads it")
     _probed_files.add(identity)
 
 
@@ -297,9 +290,8 @@ def _limit_resources(file_limit_s: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CPU, (file_limit_s, file_limit_s))
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(
-        resource.RLIMIT_AS, (MEMORY_BYTES if hard == resource.RLIM_INFINITY else min(hard, MEMORY_BYTES), hard)
-    )
+    soft = MEMORY_BYTES if hard == resource.RLIM_INFINITY else min(hard, MEMORY_BYTES)
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def _extend_cpu_limit(run_limit_s: int) -> None:

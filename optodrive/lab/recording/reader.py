@@ -42,10 +42,7 @@ def read_with_notes(path: Path) -> tuple[Measurement, str]:
     with open_tree(path) as tree, convert_errors(str(path), "a readable recording"):
         names, instrument_notes = read_header(tree)
         measurement = Measurement(tuple(_read_run(tree, name) for name in names))
-        values = [signal.value for run in measurement.runs for signal in run.signals.values()]
-        checks.check_sample_count(
-            tree.format_place(), sum(int(np.count_nonzero(np.isfinite(value))) for value in values)
-        )
+        checks.check_sample_count(tree.format_place(), measurement.runs)
         return measurement, instrument_notes
 
 
@@ -236,19 +233,13 @@ class PixelRuns:
     def read(self) -> Measurement:
         """Read the runs with this pixel's signals only. Raise InputError if the data are invalid."""
         runs = [self._select_signals(part, run) for part in self.parts for run in _read_part(part)]
-        values = [signal.value for run in runs for signal in run.signals.values()]
         subject = "mirrors" if self.pixel == MIRRORS else f"pixel {self.pixel}"
-        checks.check_sample_count(
-            f"{self.parts[0].path}: {subject}", sum(int(np.isfinite(value).sum()) for value in values)
-        )
+        checks.check_sample_count(f"{self.parts[0].path}: {subject}", runs)
         return Measurement(tuple(runs))
 
     def _select_signals(self, part: RecordingPart, run: Run) -> Run:
-        signals = {
-            name: signal
-            for name, signal in run.signals.items()
-            if self.pixel == (MIRRORS if name in MIRROR_SIGNALS else signal.pixel)
-        }
+        pixels = {name: MIRRORS if name in MIRROR_SIGNALS else signal.pixel for name, signal in run.signals.items()}
+        signals = {name: signal for name, signal in run.signals.items() if pixels[name] == self.pixel}
         return replace(run, name=f"{part.prefix}{run.name}", signals=signals)
 
 
@@ -273,10 +264,8 @@ class DisplayRuns:
             mirror_runs = tuple(run.name for run in index.runs if not set(MIRROR_SIGNALS).isdisjoint(run.signals))
             if mirror_runs:
                 mirrors.append(RecordingPart(path.absolute(), prefix, mirror_runs, stamp))
-        return cls(
-            tuple(PixelRuns(pixel, tuple(pixels[pixel])) for pixel in sorted(pixels)),
-            PixelRuns(MIRRORS, tuple(mirrors)) if mirrors else None,
-        )
+        runs = tuple(PixelRuns(pixel, tuple(pixels[pixel])) for pixel in sorted(pixels))
+        return cls(runs, PixelRuns(MIRRORS, tuple(mirrors)) if mirrors else None)
 
 
 def _read_part(part: RecordingPart) -> tuple[Run, ...]:
@@ -329,10 +318,6 @@ def _merge_run(run: Run, session_runs: dict[str, Run], session: Path, measured: 
     if len(run.pulses):
         expected = f"none: the pulses are taken from {session}"
         raise InputError(f"{place}/{PULSES}", Unquoted(f"{len(run.pulses)} pulses"), expected)
-    signals = {
-        name: Signal(signal.pixel, np.asarray(signal.t_s + shift_s), signal.value, signal.sigma)
-        for name, signal in run.signals.items()
-    }
-    return replace(
-        run, pulses=session_run.pulses, signals=signals, attributes={**run.attributes, **session_run.attributes}
-    )
+    signals = {name: replace(signal, t_s=np.asarray(signal.t_s + shift_s)) for name, signal in run.signals.items()}
+    attributes = run.attributes | session_run.attributes
+    return replace(run, pulses=session_run.pulses, signals=signals, attributes=attributes)

@@ -128,9 +128,8 @@ class SessionRecorder:
     def _stop(self, reason: str) -> None:
         was_recording, self.is_recording = self.is_recording, False
         if was_recording:
-            self._on_failure(
-                f"recording to {self.path} stopped: {reason}; what was written stays, and the display goes on"
-            )
+            then = "what was written stays, and the display goes on"
+            self._on_failure(f"recording to {self.path} stopped: {reason}; {then}")
 
 
 class SessionRecordingFile:
@@ -172,14 +171,10 @@ class SessionRecordingFile:
             group.attrs["ambient_K"] = self._metadata["ambient_K"]
             group.attrs["bridge_width_m"] = self._metadata["bridge_width_m"]
             group.attrs["sample"] = self._metadata["display"]
-            group.attrs["started_at"], group.attrs["started_unix_s"] = (
-                metadata["first_pulse_at"],
-                metadata["first_pulse_unix_s"],
-            )
-            columns = len(TABLE_COLUMNS[PULSES])
-            group.create_dataset(
-                PULSES, shape=(0, columns), maxshape=(None, columns), chunks=(256, columns), dtype="f8"
-            )
+            group.attrs["started_at"] = metadata["first_pulse_at"]
+            group.attrs["started_unix_s"] = metadata["first_pulse_unix_s"]
+            width = len(TABLE_COLUMNS[PULSES])
+            group.create_dataset(PULSES, shape=(0, width), maxshape=(None, width), chunks=(256, width), dtype="f8")
         pulses = file[f"runs/run{self._run_number}/{PULSES}"]
         pulses.resize(len(pulses) + len(executed), axis=0)
         pulses[-len(executed) :] = executed - np.array([self._run_start_s, 0.0, 0.0, 0.0])

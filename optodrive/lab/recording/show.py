@@ -18,14 +18,8 @@ RUNS_MAX = 400
 """Maximum number of plotted runs; few programs open a taller image."""
 NAME_WIDTH, LABEL_WIDTH, PANEL_WIDTH, GAP, HEAD_HEIGHT = 170, 70, 360, 14, 30
 HEIGHT_MIN, HEIGHT_MAX, TOTAL_HEIGHT = 44, 150, 8000
-BACKGROUND_COLOUR, TEXT_COLOUR, FRAME_COLOUR, PULSE_COLOUR, CURVE_COLOUR, MISSING_COLOUR = (
-    "#ffffff",
-    "#222222",
-    "#888888",
-    "#ffe3b0",
-    "#1f5fa8",
-    "#c02020",
-)
+BACKGROUND_COLOUR, TEXT_COLOUR, FRAME_COLOUR = "#ffffff", "#222222", "#888888"
+PULSE_COLOUR, CURVE_COLOUR, MISSING_COLOUR = "#ffe3b0", "#1f5fa8", "#c02020"
 
 
 def build_summary(measurement: Measurement) -> list[dict[str, Any]]:

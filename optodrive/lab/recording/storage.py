@@ -17,14 +17,8 @@ Attributes = dict[str, str | float]
 
 FORMAT = "optotactile-recording"
 VERSION = 1
-UNITS = {
-    "absorber_temperature_K": "K",
-    "displacement_m": "m",
-    "force_N": "N",
-    "mirror_x_rad": "rad",
-    "mirror_y_rad": "rad",
-}
-SIGNALS = tuple(UNITS)
+SIGNALS = ("absorber_temperature_K", "displacement_m", "force_N", "mirror_x_rad", "mirror_y_rad")
+UNITS = {name: name.rpartition("_")[2] for name in SIGNALS}
 MIRROR_SIGNALS = ("mirror_x_rad", "mirror_y_rad")
 """Signals of the scanner: they require the run's commands and belong to no pixel."""
 PULSES = "pulses"
@@ -34,10 +28,7 @@ TABLE_COLUMNS = {PULSES: ("start_s", "width_s", "power_W", "pixel"), COMMANDS: (
 SAMPLE_COLUMNS = ("t_s", "value")
 """Columns of a signal."""
 RUN_MEMBERS = (*TABLE_COLUMNS, *SIGNALS)
-PLAN_TABLES = {
-    "planned": ("start_s", "width_s", "power_W", "pixel", "trimmed_J"),
-    "executed": ("start_s", "width_s", "power_W", "pixel"),
-}
+PLAN_TABLES = {"planned": (*TABLE_COLUMNS[PULSES], "trimmed_J"), "executed": TABLE_COLUMNS[PULSES]}
 """Tables of a session's plan and their columns."""
 PLAN_TEXTS = ("labels", "parameters")
 """JSON objects of a session's plan."""
@@ -95,9 +86,8 @@ class MemoryBudget:
         """Count numbers that are about to be read. Raise InputError if the limit is exceeded."""
         self._remaining -= numbers
         if self._remaining < 0:
-            raise InputError(
-                place, f"{numbers} numbers", f"at most {NUMBERS_MAX} in total; read large recordings in parts"
-            )
+            expected = f"at most {NUMBERS_MAX} in total; read large recordings in parts"
+            raise InputError(place, f"{numbers} numbers", expected)
 
 
 @contextmanager
@@ -133,9 +123,8 @@ def check_run_name(place: str, name: str) -> None:
     encoded = name.encode("utf-8", "replace")
     fits = name.isprintable() and not set(name) & {"/", "\\"} and not name.startswith(".")
     if not (fits and 0 < len(encoded) <= NAME_BYTES_MAX and name == name.strip()):
-        raise InputError(
-            place, name, f"a run's name: printable, at most {NAME_BYTES_MAX} bytes, no '/', '\\' or leading '.'"
-        )
+        expected = f"a run's name: printable, at most {NAME_BYTES_MAX} bytes, no '/', '\\' or leading '.'"
+        raise InputError(place, name, expected)
 
 
 def natural_sort_key(name: str) -> tuple[object, ...]:
@@ -174,11 +163,8 @@ def _decode_text(value: bytes) -> str:
 
 def normalize_attributes(values: dict[str, Any]) -> Attributes:
     """Return those attributes that are text or numbers."""
-    converted = {
-        name: normalize_attribute(value)
-        for name, value in values.items()
-        if 0 < len(name) <= KEY_MAX and name.isprintable()
-    }
+    names = [name for name in values if 0 < len(name) <= KEY_MAX and name.isprintable()]
+    converted = {name: normalize_attribute(values[name]) for name in names}
     return {name: value for name, value in converted.items() if value is not None}
 
 

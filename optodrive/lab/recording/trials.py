@@ -10,13 +10,13 @@ from typing import Any
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.numeric_tables import escape_formula
-from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.recording.hdf5 import Hdf5Tree
 from optodrive.lab.recording.reader import open_tree
-from optodrive.lab.recording.storage import Attributes, convert_errors, natural_sort_key
+from optodrive.lab.recording.storage import PLAN_TABLES, PLAN_TEXTS, Attributes, convert_errors, natural_sort_key
 
 CLOCKS = ("board_s", "monotonic_s", "unix_s")
 """Clocks of an onset: the board's, the host's monotonic one, and Unix time."""
+KINDS = ("requested", "executed")
 TIME_MAX_S = 1e11
 LABEL_PREFIX = "label_"
 SURROGATE = re.compile("[\ud800-\udfff]")
@@ -64,7 +64,7 @@ def read_trials_if_any(path: Path) -> list[Trial]:
 def format_csv(trials: list[Trial]) -> str:
     """Return a table with one row per trial and one column per label, of which a spreadsheet runs nothing."""
     keys = list(dict.fromkeys(key for trial in trials for key in trial.labels))
-    onsets = [f"{kind}_{clock}" for kind in ("requested", "executed") for clock in CLOCKS]
+    onsets = [f"{kind}_{clock}" for kind in KINDS for clock in CLOCKS]
     head = ["plan", "name", "run", "status", "error", *onsets, "planned_pulses", "executed_pulses"]
     out = StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -80,21 +80,13 @@ def format_csv(trials: list[Trial]) -> str:
 def _read_trial(tree: Hdf5Tree, path: Path, plan: str) -> Trial:
     place = f"{path}: /plans/{plan}"
     attributes, texts, tables = tree.read_plan(plan)
-    executed = tables.get("executed")
     name, run, status, error = (str(attributes.get(key, "")) for key in ("name", "run", "status", "error"))
-    return Trial(
-        plan,
-        name,
-        run,
-        status,
-        error,
-        _read_object(f"{place}/labels", texts.get("labels", "{}")),
-        _read_object(f"{place}/parameters", texts.get("parameters", "{}")),
-        {clock: _read_time_s(place, attributes, f"requested_{clock}") for clock in CLOCKS},
-        {clock: _read_time_s(place, attributes, f"executed_{clock}") for clock in CLOCKS},
-        _count(tables.get("planned")),
-        _count(executed),
+    labels, parameters = (_read_object(f"{place}/{key}", texts.get(key, "{}")) for key in PLAN_TEXTS)
+    requested, executed = (
+        {clock: _read_time_s(place, attributes, f"{kind}_{clock}") for clock in CLOCKS} for kind in KINDS
     )
+    counts = (len(tables.get(key, ())) for key in PLAN_TABLES)
+    return Trial(plan, name, run, status, error, labels, parameters, requested, executed, *counts)
 
 
 def _read_time_s(place: str, attributes: Attributes, name: str) -> float | None:
@@ -118,7 +110,3 @@ def _read_object(place: str, text: str) -> dict[str, Any]:
 
 def _refuse_constant(place: str, name: str) -> None:
     raise InputError(place, Unquoted(name), "finite numbers")
-
-
-def _count(table: FloatArray | None) -> int:
-    return 0 if table is None else len(table)

@@ -68,9 +68,8 @@ def _normalize_run(place: str, run: Run) -> Run:
         _check_shape(f"{place}/{COMMANDS}", run.commands, len(TABLE_COLUMNS[COMMANDS]))
     for name in run.signals:
         if name not in SIGNALS:
-            raise InputError(
-                f"{place}/{format_name(name)}", name, f"a known signal, {suggest_nearest(name, list(SIGNALS))}"
-            )
+            expected = f"a known signal, {suggest_nearest(name, list(SIGNALS))}"
+            raise InputError(f"{place}/{format_name(name)}", name, expected)
     # NumPy scalars have another repr than Python's own numbers.
     attributes = normalize_attributes(run.attributes)
     signals = {name: _normalize_signal(f"{place}/{name}", signal) for name, signal in run.signals.items()}

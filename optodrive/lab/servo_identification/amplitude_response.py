@@ -12,13 +12,15 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
-from optodrive.lab.inference.claim import Alternative, Evidence, HeldOutChange, claim
+from optodrive.lab.inference.claim import HeldOutChange
 from optodrive.lab.inference.sentences import describe_sufficiency
 from optodrive.lab.servo_identification.effect_fit import (
     LINEAR,
     OTHER,
     SYSTEMATIC_WEIGHT,
     build_probabilities,
+    claim_effect,
+    name_probabilities,
 )
 from optodrive.lab.servo_identification.effects import FRICTION, HYSTERESIS, LABELS, STIFFNESS
 from optodrive.lab.servo_identification.modal_response import (
@@ -87,9 +89,9 @@ class AmplitudeData:
         static = self.lines[self.lines < STATIC_SHARE * int(np.argmax(size))]
         if len(static) < 16:
             static = self.lines[:16]
+        parts = ((first[each], last[each]) for each in np.array_split(static, 8))
         bands = [
-            complex((last[each] * np.conj(first[each])).sum() / (np.abs(first[each]) ** 2).sum()) - 1.0
-            for each in np.array_split(static, 8)
+            complex((after * np.conj(before)).sum() / (np.abs(before) ** 2).sum()) - 1.0 for before, after in parts
         ]
         ratios = [each.imag / each.real for each in bands]
         return complex(np.mean(bands)), float(np.std(ratios) / np.sqrt(len(bands)))
@@ -131,14 +133,13 @@ def build_amplitude_data(responses: PeriodicResponses) -> AmplitudeData:
     rows = [np.flatnonzero(train & (group == each)) for each in range(count)]
     if min(map(len, rows)) < 2:
         raise InputError("realisations", min(map(len, rows)) + 1, "at least 3 of each amplitude of coupled axes")
-    parts = [
-        np.stack([fit_response(responses, np.isin(np.arange(len(group)), each[part])) for each in rows])
-        for part in (slice(None), slice(0, None, 2), slice(1, None, 2))
-    ]
-    levels = np.array([float(responses.level[each].mean()) for each in rows])
-    return AmplitudeData(
-        responses.sample_rate_hz, find_excited_lines(responses), levels, parts[0], (parts[1], parts[2])
+    number = np.arange(len(group))
+    whole, first, second = (
+        np.stack([fit_response(responses, np.isin(number, each[begin::step])) for each in rows])
+        for begin, step in ((0, 1), (0, 2), (1, 2))
     )
+    levels = np.array([float(responses.level[each].mean()) for each in rows])
+    return AmplitudeData(responses.sample_rate_hz, find_excited_lines(responses), levels, whole, (first, second))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,22 +185,15 @@ def assess_coupled(responses: PeriodicResponses) -> CoupledAxes:
     unknown = separate + OTHER_SHARE * max(mean2[LINEAR] - separate, 0.0)
     score[OTHER] = -SYSTEMATIC_WEIGHT * np.log(unknown) + np.log(OTHER_ODDS)
     probabilities = build_probabilities(score)
-    excess = mean2[LINEAR] - min(separate, *mean2.values())
-    alternatives = []
-    for (name,), _ in probabilities.ranked:
-        share = (mean2[LINEAR] - mean2[name]) / max(excess, 1e-300)
-        alternatives.append(
-            Alternative((name,), (share, share), _list_changes(responses, errors[name], errors[LINEAR]))
-        )
-    found = claim(Evidence(probabilities, tuple(alternatives)))
+    changes = {name: _list_changes(responses, errors[name], errors[LINEAR]) for name in LAGS}
+    found = claim_effect(probabilities, mean2, min(separate, *mean2.values()), changes, {})
     report = {
         "verdict": found.verdict,
         "sentences": describe_sufficiency(found, probabilities, "One linear servo", LABELS),
         "law": law,
         "exponent": models[law].exponent,
         "number_count": models[law].number_count,
-        "probability": {keys[0]: each for keys, each in probabilities.causes.items()}
-        | {LINEAR: probabilities.no_effect, OTHER: probabilities.none_of_these},
+        "probability": name_probabilities(probabilities),
         "noise": responses.noise,
         "error": {name: {f"{level:.4g}": each for level, each in of.items()} for name, of in errors.items()},
         "gain": 1.0 - float(np.sqrt(mean2[law] / mean2[LINEAR])),
@@ -227,15 +221,12 @@ def _list_changes(
     The errors are systematic, so what counts as noise is that of their mean square over the lines of a realisation.
     """
     size = responses.y[:, :, 0].size
-    return tuple(
-        HeldOutChange(
-            f"{level:.3g} rms",
-            "the output",
-            size * (error**2 - linear[level] ** 2) / responses.noise**2,
-            np.sqrt(2.0 * size) * (error / responses.noise) ** 2,
-        )
-        for level, error in found.items()
-    )
+    changes = []
+    for level, error in found.items():
+        chi2 = size * (error**2 - linear[level] ** 2) / responses.noise**2
+        noise = np.sqrt(2.0 * size) * (error / responses.noise) ** 2
+        changes.append(HeldOutChange(f"{level:.3g} rms", "the output", chi2, noise))
+    return tuple(changes)
 
 
 def _list_resonances(model: ModalResponse, levels: FloatArray) -> list[dict[str, float]]:
@@ -273,9 +264,8 @@ def describe_coupled(report: dict[str, Any]) -> list[str]:
     between = f"{report['error_between_share']:.2%} of the output"
     lines.append(f"between          error at an amplitude between measured ones {between}")
     change, lag = report["static_gain_change"], -report["static_phase_change_rad"]
-    lines.append(
-        f"below resonance  gain {change:+.2%} and lag {lag:+.4f} rad from the smallest to the largest amplitude"
-    )
+    ends = "from the smallest to the largest amplitude"
+    lines.append(f"below resonance  gain {change:+.2%} and lag {lag:+.4f} rad {ends}")
     for each in report["resonances"]:
         lines.append(
             f"resonance        {each['frequency_hz']:.1f} Hz, damping {each['damping']:.4f}; {each['shift']:+.2%} and "

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, ReadOnlyArrays
 from optodrive.core.types.discrepancy import Probabilities
 from optodrive.device.servo import Servo
 from optodrive.lab.inference.claim import Alternative, Claim, Evidence, HeldOutChange, claim
@@ -19,11 +19,13 @@ from optodrive.lab.servo_identification.effects import (
     EFFECTS,
     FORMS,
     LINEAR_FORM,
+    NO_EFFECT,
     SATURATION,
     SLEW_LIMIT,
+    NonlinearServo,
+    Pair,
     ServoNonlinearity,
     build_drive,
-    respond,
     sample_angle,
 )
 
@@ -60,7 +62,7 @@ AT_END = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class ServoRecord:
+class ServoRecord(ReadOnlyArrays):
     """One run of one axis: commands [k] that hold from at_s on, angles [m] at t_s, rms noise of a sample.
 
     use: [m], False where a sample is not compared; held_out: the run is for comparison only; level: rms of the commands
@@ -75,22 +77,16 @@ class ServoRecord:
     noise: float
     level: float = 0.0
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
 
 @dataclass(frozen=True, eq=False)
 class FormFit:
     """A fitted form.
 
-    base: log ω, ζ, delay in s; effect, scale: parameters of `integrate`; residual: of the samples that are compared, in
-    units of the noise; misfit2: its mean square; doubt: why its size is uncertain, or ""
+    residual: of the samples that are compared, in units of the noise; misfit2: its mean square; doubt: why the size of
+    its effect is uncertain, or ""
     """
 
-    form: ServoNonlinearity
-    base: tuple[float, float, float]
-    effect: tuple[float, float]
-    scale: float
+    servo: NonlinearServo
     residual: FloatArray
     misfit2: float
     doubt: str
@@ -113,8 +109,7 @@ class Linearity:
     @property
     def probability(self) -> dict[str, float]:
         """Probability of each effect, of LINEAR and of OTHER."""
-        effects = {keys[0]: each for keys, each in self.probabilities.causes.items()}
-        return effects | {LINEAR: self.probabilities.no_effect, OTHER: self.probabilities.none_of_these}
+        return name_probabilities(self.probabilities)
 
     @property
     def effect(self) -> str | None:
@@ -133,15 +128,11 @@ class ServoData:
         self.h_s = max(1.0 / (STEPS_PER_TIME_CONSTANT * max(omega, fastest)), span_s / STEPS_MAX)
         self.cells = [int((each.t_s[-1] - each.at_s[0]) / self.h_s) + 2 for each in records]
         self.used_s = [each.t_s[each.use] for each in records]
-        self.noise = np.concatenate(
-            [np.full(len(t_s), each.noise) for each, t_s in zip(records, self.used_s, strict=True)]
-        )
+        self.noise = np.concatenate([np.full(each.use.sum(), each.noise) for each in records])
         self.target = np.concatenate([(each.value / each.noise)[each.use] for each in records])
         self.drives = lru_cache(maxsize=6)(self._drives)
 
-    def _drives(
-        self, form: ServoNonlinearity, effect: tuple[float, float], delay_s: float, parts: int
-    ) -> list[FloatArray]:
+    def _drives(self, form: ServoNonlinearity, effect: Pair, delay_s: float, parts: int) -> list[FloatArray]:
         """Return mean and slope of each record's command in the parts of its cells, [n, 2]."""
         h_s = self.h_s / parts
         return [
@@ -149,32 +140,30 @@ class ServoData:
             for each, cells in zip(self.records, self.cells, strict=True)
         ]
 
-    def integrate(
-        self, form: ServoNonlinearity, base: FloatArray, effect: tuple[float, float], scale: float
-    ) -> list[FloatArray]:
+    def integrate(self, servo: NonlinearServo) -> list[FloatArray]:
         """Return angle and speed on the grid of each record, [n, 2]."""
-        of_command = (form, effect) if form.changes_command else (LINEAR_FORM, (1.0, 1.0))
-        drives, cell = self.drives(*of_command, float(base[2]), form.substeps), (self.h_s / form.substeps, scale)
-        return [respond(form, effect, (base[0], base[1]), drive, cell) for drive in drives]
+        form, base = servo.form, servo.base
+        of_command = (form, servo.effect) if form.changes_command else (LINEAR_FORM, NO_EFFECT)
+        drives = self.drives(*of_command, float(base[2]), form.substeps)
+        return [servo.respond(drive, self.h_s / form.substeps) for drive in drives]
 
-    def simulate(
-        self,
-        form: ServoNonlinearity,
-        base: FloatArray,
-        effect: tuple[float, float] = (1.0, 1.0),
-        scale: float = 1.0,
-        taps: int = FORM_TAPS,
-        stride: int = 1,
-    ) -> FloatArray:
+    def simulate(self, servo: NonlinearServo, taps: int = FORM_TAPS, stride: int = 1) -> FloatArray:
         """Return the angles at every stride-th used sample, and each tap earlier, in units of noise, [m, taps]."""
         columns, begin, row = np.empty((len(self.target[::stride]), taps)), 0, 0
-        for each, states, t_s in zip(self.records, self.integrate(form, base, effect, scale), self.used_s, strict=True):
+        for each, states, t_s in zip(self.records, self.integrate(servo), self.used_s, strict=True):
             mine, angle = t_s[-begin % stride :: stride], np.empty(len(t_s[-begin % stride :: stride]))
             for tap in range(taps):
-                sample_angle(states, each.at_s[0], self.h_s / form.substeps, mine - tap * self.tap_s, angle)
+                sample_angle(states, each.at_s[0], self.h_s / servo.form.substeps, mine - tap * self.tap_s, angle)
                 columns[row : row + len(mine), tap] = angle / each.noise
             begin, row = begin + len(t_s), row + len(mine)
         return columns
+
+    def compare(self, servo: NonlinearServo, stride: int) -> tuple[FloatArray, float, float]:
+        """Return the residual of a servo with free gain and offset at every stride-th used sample, and these two."""
+        target = self.target[::stride]
+        model = np.column_stack([1.0 / self.noise[::stride], self.simulate(servo, 1, stride)])
+        offset, gain = np.linalg.lstsq(model, target, rcond=None)[0]
+        return np.asarray(target - model @ [offset, gain]), float(gain), float(offset)
 
     def free_response(self, base: FloatArray) -> FloatArray:
         """Return the columns of a free linear response, [m, …]: offset, taps of command and of linear angle."""
@@ -185,29 +174,24 @@ class ServoData:
             before, after = np.minimum(shifted_s - each.at_s[0], 0.0), np.maximum(shifted_s - each.at_s[-1], 0.0)
             areas = np.interp(shifted_s, each.at_s, area) + each.command[0] * before + each.command[-1] * after
             blocks.append(np.column_stack([np.ones(len(t_s)), -np.diff(areas, axis=1) / self.tap_s]) / each.noise)
-        return np.column_stack([np.concatenate(blocks), self.simulate(LINEAR_FORM, base, taps=ANGLE_TAPS)])
+        return np.column_stack([np.concatenate(blocks), self.simulate(NonlinearServo(LINEAR_FORM, base), ANGLE_TAPS)])
 
 
 def fit_linear(records: list[ServoRecord], omega: float) -> FloatArray:
     """Fit a linear second-order servo with delay, gain and offset from about omega: log ω, ζ, delay in s."""
     data = ServoData(records, omega)
     stride = max(1, len(data.target) // FIT_SAMPLES_MAX)
-    constant, target = 1.0 / data.noise[::stride], data.target[::stride]
 
     def residual(base: FloatArray) -> FloatArray:
-        model = np.column_stack([constant, data.simulate(LINEAR_FORM, base, taps=1, stride=stride)])
-        return np.asarray(target - model @ np.linalg.lstsq(model, target, rcond=None)[0])
+        return data.compare(NonlinearServo(LINEAR_FORM, base), stride)[0]
 
     period_s = 2.0 * np.pi / omega
     low, high = np.array([np.log(omega / 6.0), 0.02, 0.0]), np.array([np.log(omega * 6.0), 3.0, period_s])
     starts = [np.array([np.log(omega * factor), 0.6, 0.03 * period_s]) for factor in START_FACTORS]
     starts.sort(key=lambda each: float((residual(each) ** 2).sum()))
-    found = [
-        fit_residuals(residual, each, (low, high), np.array([1e-4, 1e-4, 1e-4 * period_s]), evaluations=30)
-        for each in starts[:STARTS_REFINED]
-    ]
-    best: FloatArray = min(found, key=lambda each: each.chi2).x
-    return best
+    step, best_starts = np.array([1e-4, 1e-4, 1e-4 * period_s]), starts[:STARTS_REFINED]
+    found = [fit_residuals(residual, each, (low, high), step, evaluations=30) for each in best_starts]
+    return min(found, key=lambda each: each.chi2).x
 
 
 def find_effect(records: list[ServoRecord], omega: float, servo: Servo | None = None) -> Linearity:
@@ -224,23 +208,44 @@ def find_effect(records: list[ServoRecord], omega: float, servo: Servo | None = 
         forms = sorted((each for each in FORMS if each.effect == effect), key=lambda each: screened[each].misfit2)
         limit = CONTENDER * min(screened[forms[0]].misfit2, OUTSIDER * best)
         contenders = [each for each in forms if each is forms[0] or screened[each].misfit2 <= limit]
-        refined = [fits.fit(each, True, (screened[each].base, screened[each].effect)) for each in contenders]
+        refined = [fits.fit(each, True, screened[each].servo) for each in contenders]
         if effect == SLEW_LIMIT and servo is not None:
-            core = float(np.log(2.0 * np.pi * servo.frequency)), servo.damping, servo.delay
-            refined.append(fits.fit(FORMS[0], True, (core, (servo.slew, 1.0))))
+            core = np.array([np.log(2.0 * np.pi * servo.frequency), servo.damping, servo.delay])
+            refined.append(fits.fit(FORMS[0], True, NonlinearServo(FORMS[0], core, (servo.slew, 1.0))))
         named[effect] = min(refined, key=lambda each: each.misfit2)
     probabilities = fits.weigh(named)
     linear, winner = named[LINEAR], min(named.values(), key=lambda each: each.misfit2)
-    excess = max(linear.misfit2 - min(1.0, winner.misfit2), 1e-12)
-    alternatives = []
-    for (effect,), _ in probabilities.ranked:
-        found = named[effect]
-        share = (linear.misfit2 - found.misfit2) / excess
-        doubts = {effect: found.doubt} if found.doubt else {}
-        alternatives.append(Alternative((effect,), (share, share), fits.list_changes(found, linear), doubts))
-    evidence = Evidence(probabilities, tuple(alternatives))
+    misfit2 = {name: each.misfit2 for name, each in named.items()}
+    changes = {name: fits.list_changes(each, linear) for name, each in named.items()}
+    doubts = {name: each.doubt for name, each in named.items()}
+    found = claim_effect(probabilities, misfit2, min(1.0, winner.misfit2), changes, doubts)
     gain = 1.0 - float(np.sqrt(winner.misfit2 / linear.misfit2))
-    return Linearity(claim(evidence), probabilities, named, gain, base)
+    return Linearity(found, probabilities, named, gain, base)
+
+
+def claim_effect(
+    probabilities: Probabilities,
+    error2: Mapping[str, float],
+    floor2: float,
+    changes: Mapping[str, tuple[HeldOutChange, ...]],
+    doubts: Mapping[str, str],
+) -> Claim:
+    """Return the claim on effects.
+
+    error2: mean squares by effect and of LINEAR; floor2: that without the excess; doubts: clauses, "" for none
+    """
+    excess = max(error2[LINEAR] - floor2, 1e-300)
+    alternatives = []
+    for (name,), _ in probabilities.ranked:
+        share, doubt = (error2[LINEAR] - error2[name]) / excess, doubts.get(name, "")
+        alternatives.append(Alternative((name,), (share, share), changes[name], {name: doubt} if doubt else {}))
+    return claim(Evidence(probabilities, tuple(alternatives)))
+
+
+def name_probabilities(probabilities: Probabilities) -> dict[str, float]:
+    """Return the probability of each effect, of LINEAR and of OTHER."""
+    effects = {keys[0]: each for keys, each in probabilities.causes.items()}
+    return effects | {LINEAR: probabilities.no_effect, OTHER: probabilities.none_of_these}
 
 
 def build_probabilities(score: Mapping[str, float]) -> Probabilities:
@@ -292,8 +297,8 @@ class EffectFits:
 
     def _measure_scales(self) -> dict[str, float]:
         omega, zeta, h_s = float(np.exp(self.base[0])), float(self.base[1]), self.train.h_s
-        command = np.concatenate(self.train.drives(LINEAR_FORM, (1.0, 1.0), float(self.base[2]), 1))[:, 0]
-        angle, speed = np.concatenate(self.train.integrate(LINEAR_FORM, self.base, (1.0, 1.0), 1.0)).T
+        command = np.concatenate(self.train.drives(LINEAR_FORM, NO_EFFECT, float(self.base[2]), 1))[:, 0]
+        angle, speed = np.concatenate(self.train.integrate(NonlinearServo(LINEAR_FORM, self.base))).T
         largest = float(np.abs(command).max())
         return {
             "one": 1.0,
@@ -305,28 +310,22 @@ class EffectFits:
             "acceleration": float(np.abs(command - angle - 2.0 * zeta / omega * speed).max()),
         }
 
-    def fit(
-        self,
-        form: ServoNonlinearity,
-        completely: bool,
-        start: tuple[tuple[float, float, float], tuple[float, float]] | None = None,
-    ) -> FormFit:
-        """Fit a form: the effect's parameters alone, or all of them. start: base and effect."""
+    def fit(self, form: ServoNonlinearity, completely: bool, start: NonlinearServo | None = None) -> FormFit:
+        """Fit a form: the effect's parameters alone, or all of them."""
         period_s = 2.0 * np.pi / float(np.exp(self.base[0]))
         unit, spans = np.array([1.0, 1.0, period_s]), (form.first, form.second)
         size = np.array([self.scales[each.scale] for each in spans])
         is_log = np.array([each.low > 0.0 for each in spans])
 
         def pack(pair: tuple[float, ...] | FloatArray) -> FloatArray:
-            packed: FloatArray = np.where(is_log, np.log(np.where(is_log, pair, 1.0)), pair)
-            return packed
+            return np.asarray(np.where(is_log, np.log(np.where(is_log, pair, 1.0)), pair))
 
-        def unpack(x: FloatArray) -> tuple[FloatArray, tuple[float, float]]:
+        def unpack(x: FloatArray) -> NonlinearServo:
             first, second = (np.where(is_log, np.exp(np.where(is_log, x[3:], 0.0)), x[3:]) * size).tolist()
-            return self.base + x[:3] * unit, (first, second)
+            return NonlinearServo(form, self.base + x[:3] * unit, (first, second), self.scales["angle"])
 
         def residual(x: FloatArray) -> FloatArray:
-            simulated = self.train.simulate(form, *unpack(x), self.scales["angle"], stride=self.stride)
+            simulated = self.train.simulate(unpack(x), stride=self.stride)
             if not np.abs(simulated).max() < UNSTABLE:
                 return np.asarray(self.y * UNSTABLE)
             beside = simulated - self.part @ (self.part.T @ simulated)
@@ -334,12 +333,11 @@ class EffectFits:
 
         low = np.array([-0.7, 0.02 - self.base[1], -self.base[2] / period_s, *pack(tuple(each.low for each in spans))])
         high = np.array([max(1.2, self.shift + 0.4), 1.0, 0.5, *pack(tuple(each.high for each in spans))])
-        shifts = (
-            (*FREQUENCY_SHIFTS, max(self.shift, 0.0)) if form.effect in (LINEAR, SLEW_LIMIT, SATURATION) else (0.0,)
-        )
+        slows_down = form.effect in (LINEAR, SLEW_LIMIT, SATURATION)
+        shifts = (*FREQUENCY_SHIFTS, max(self.shift, 0.0)) if slows_down else (0.0,)
         starts = [np.array([at, 0.0, 0.0, *pack(pair)]) for pair in form.starts for at in shifts]
         if start is not None:
-            starts = [np.array([*((np.array(start[0]) - self.base) / unit), *pack(np.array(start[1]) / size)])]
+            starts = [np.array([*((start.base - self.base) / unit), *pack(np.array(start.effect) / size)])]
         found = fit_residuals(
             residual,
             min(starts, key=lambda each: float((residual(each) ** 2).sum())),
@@ -349,18 +347,17 @@ class EffectFits:
             prior=Prior(np.zeros(5), np.append(PRIOR / np.sqrt(len(self.y)), [np.inf, np.inf])),
             evaluations=25 if completely else 6,
         )
-        base, effect = unpack(found.x)
-        left = self._compare(form, base, effect)
+        servo = unpack(found.x)
+        left = self._compare(servo)
         doubt, end = "", AT_END * (high[3] - low[3])
         # An interval that contains no effect needs no test of its own: the linear fit is the profile's end.
         if end > 0.0 and not low[3] + end < found.x[3] < high[3] - end:
             doubt = f"the fit of its {form.name} ended at a limit of its range"
-        core = float(base[0]), float(base[1]), float(base[2])
-        return FormFit(form, core, effect, self.scales["angle"], left, float((left**2).mean()), doubt)
+        return FormFit(servo, left, float((left**2).mean()), doubt)
 
-    def _compare(self, form: ServoNonlinearity, base: FloatArray, effect: tuple[float, float]) -> FloatArray:
+    def _compare(self, servo: NonlinearServo) -> FloatArray:
         """Return the residual in the runs compared, infinite if the model is unstable."""
-        trained, tested = (each.simulate(form, base, effect, self.scales["angle"]) for each in (self.train, self.test))
+        trained, tested = (each.simulate(servo) for each in (self.train, self.test))
         if not max(np.abs(trained).max(), np.abs(tested).max()) < UNSTABLE:
             return np.full(len(self.test.target), np.inf)
         y = self.train.target

@@ -18,13 +18,8 @@ import numpy as np
 from optodrive.core.kernels import array_kernel
 from optodrive.core.types.arrays import FloatArray
 
-SLEW_LIMIT, SATURATION, FRICTION, HYSTERESIS, STIFFNESS = (
-    "slew_limit",
-    "saturation",
-    "dry_friction",
-    "hysteresis",
-    "amplitude_dependent_stiffness",
-)
+SLEW_LIMIT, SATURATION, FRICTION, HYSTERESIS = "slew_limit", "saturation", "dry_friction", "hysteresis"
+STIFFNESS = "amplitude_dependent_stiffness"
 EFFECTS = (SLEW_LIMIT, SATURATION, FRICTION, HYSTERESIS, STIFFNESS)
 LABELS = {
     SLEW_LIMIT: "a slew limit",
@@ -42,6 +37,11 @@ NONE, SLEW, CLIP, SOFT_CLIP, BACKLASH, INPUT_LAG, RAYLEIGH, SMOOTH_LAG = range(8
 VELOCITY, TORQUE, ACCELERATION, STOP, COULOMB, STRIBECK, PRESLIDING, SPRING_LAG, SPRING = range(8, 17)
 FIRST_OF_MOTION = VELOCITY
 """Kinds below this change the command alone."""
+
+
+Pair = tuple[float, float]
+"""Both parameters of an effect."""
+NO_EFFECT = (1.0, 1.0)
 
 
 class Span(NamedTuple):
@@ -85,7 +85,7 @@ class ServoNonlinearity:
         return 6 if self.kind in (TORQUE, ACCELERATION) else 1
 
     @property
-    def starts(self) -> list[tuple[float, float]]:
+    def starts(self) -> list[Pair]:
         """Starts of both parameters together."""
         first, second = self.first.starts, self.second.starts
         return list(zip(first, second if len(second) > 1 else second * len(first), strict=True))
@@ -201,22 +201,23 @@ def average_cells(count: int, command: Breakpoints, start_s: float, h_s: float, 
         out[cell, 0], out[cell, 1] = mean / h_s, 12.0 * moment / h_s**3
 
 
+def change_command(kind: int, effect: Pair, at_s: FloatArray, command: FloatArray) -> Breakpoints:
+    """Return the breakpoints of a command [k] that holds from at_s on, after an effect on it."""
+    changed = Breakpoints(*np.empty((3, 2 * len(command))))
+    count = transform_command(kind, *effect, at_s, command, changed)
+    return Breakpoints(*(column[:count] for column in changed))
+
+
 def build_drive(
-    form: ServoNonlinearity,
-    effect: tuple[float, float],
-    at_s: FloatArray,
-    command: FloatArray,
-    cells: tuple[float, float, int],
+    form: ServoNonlinearity, effect: Pair, at_s: FloatArray, command: FloatArray, cells: tuple[float, float, int]
 ) -> FloatArray:
     """Return mean and slope of a command [k] that holds from at_s on, after an effect on it, in cells: [n, 2].
 
     cells: time at which the first begins, duration, and number
     """
-    kind, (first, second) = (form.kind, effect) if form.changes_command else (NONE, (1.0, 1.0))
-    changed = Breakpoints(*np.empty((3, 2 * len(command))))
-    count = transform_command(kind, first, second, at_s, command, changed)
-    drive = np.empty((cells[2], 2))
-    average_cells(count, changed, *cells[:2], drive)
+    kind, parameters = (form.kind, effect) if form.changes_command else (NONE, NO_EFFECT)
+    changed, drive = change_command(kind, parameters, at_s, command), np.empty((cells[2], 2))
+    average_cells(len(changed.value), changed, *cells[:2], drive)
     return drive
 
 
@@ -237,21 +238,23 @@ class Motion(NamedTuple):
     step: FloatArray
 
 
-def respond(
-    form: ServoNonlinearity,
-    effect: tuple[float, float],
-    base: tuple[float, float],
-    drive: FloatArray,
-    cell: tuple[float, float],
-) -> FloatArray:
-    """Return angle and speed after each cell for the command's mean and slope in each [n, 2], from rest: [n, 2].
+class NonlinearServo(NamedTuple):
+    """A servo with an effect.
 
-    base: log ω and ζ; cell: duration, s, and deflection to which spring and Stribeck speed refer
+    base: log ω, ζ and delay, s; effect: its parameters; scale: deflection to which spring and Stribeck speed refer
     """
-    omega, zeta, states = float(np.exp(base[0])), float(base[1]), np.empty_like(drive)
-    motion = Motion(form.kind, *effect, omega, zeta, *cell, propagate(omega, zeta, cell[0]))
-    integrate(motion, drive, states)
-    return states
+
+    form: ServoNonlinearity
+    base: FloatArray
+    effect: Pair = NO_EFFECT
+    scale: float = 1.0
+
+    def respond(self, drive: FloatArray, h_s: float) -> FloatArray:
+        """Return angle and speed after each cell of h_s for the command's mean and slope in each, from rest: [n, 2]."""
+        omega, zeta, states = float(np.exp(self.base[0])), float(self.base[1]), np.empty_like(drive)
+        step = propagate(omega, zeta, h_s)
+        integrate(Motion(self.form.kind, *self.effect, omega, zeta, h_s, self.scale, step), drive, states)
+        return states
 
 
 @array_kernel

@@ -16,19 +16,8 @@ from optodrive.device.config_sections import ServoSection
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.amplitude_response import CoupledAxes
-from optodrive.lab.servo_identification.effect_fit import (
-    LINEAR,
-    OTHER,
-    STEPS_MAX,
-    STEPS_PER_TIME_CONSTANT,
-    FormFit,
-    Linearity,
-)
-from optodrive.lab.servo_identification.effects import (
-    SLEW_LIMIT,
-    build_drive,
-    respond,
-)
+from optodrive.lab.servo_identification.effect_fit import LINEAR, OTHER, STEPS_MAX, STEPS_PER_TIME_CONSTANT, Linearity
+from optodrive.lab.servo_identification.effects import SLEW_LIMIT, NonlinearServo, build_drive
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 
 DAMPING_MIN, COMMON_DAMPING_MAX = 0.3, 0.9
@@ -82,22 +71,16 @@ def find_common_servo(
     settle: further lower bound of the settling time of a move of an axis, s
     """
     moves = _list_moves(config)
-    required_s = np.array(
-        [
-            max(mirrors[axis].settling_s(step, tolerance)[2], settle(axis, step, tolerance))
-            for step, tolerance, axis in moves
-        ]
-    )
+    bounds_s = [
+        (mirrors[axis].settling_s(step, tolerance)[2], settle(axis, step, tolerance)) for step, tolerance, axis in moves
+    ]
+    required_s = np.max(bounds_s, axis=1)
     delay_s, slew = max(each.servo.delay for each in mirrors), min(each.servo.slew for each in mirrors)
     starts = [replace(mirror.servo, delay=delay_s, slew=slew) for mirror in mirrors]
     candidates = [_slow_to_required(start, moves, required_s) for start in starts]
     servo = min(candidates, key=lambda each: float(_settling_times_s(each, moves).mean()))
-    steps_rad = [step for step, _, _ in moves]
-    ratio = max(
-        _acceleration_energy(each.servo, step) / _acceleration_energy(servo, step)
-        for each in mirrors
-        for step in steps_rad
-    )
+    pairs = ((each.servo, step) for each in mirrors for step, _, _ in moves)
+    ratio = max(_acceleration_energy(own, step) / _acceleration_energy(servo, step) for own, step in pairs)
     return CommonServo(servo, min(1.0, 1.0 / sqrt(ratio)), _settling_excess(mirrors, servo, moves))
 
 
@@ -181,9 +164,8 @@ def _slow_to_required(start: Servo, moves: list[tuple[float, float, int]], requi
             return servo
         if servo.frequency * FREQUENCY_STEP < FREQUENCY_MIN_HZ:
             worst = int(np.argmax(required_s - settling_s))
-            expected = (
-                f"at most {1e3 * settling_s[worst]:.3g} ms, those of {FREQUENCY_MIN_HZ:g} Hz, the slowest in a file"
-            )
+            slowest = f"{FREQUENCY_MIN_HZ:g} Hz, the slowest in a file"
+            expected = f"at most {1e3 * settling_s[worst]:.3g} ms, those of {slowest}"
             raise InputError("settling time", f"{1e3 * required_s[worst]:.3g} ms", expected)
         servo = replace(servo, frequency=servo.frequency * FREQUENCY_STEP)
 
@@ -244,17 +226,17 @@ def assess(linearity: Linearity, residual_rad: float, config: Config, axis: int)
     residual_rad: rms of the difference between recording and servo
     """
     name = linearity.effect or (OTHER if linearity.claim.verdict == "unexplained" else UNRESOLVED)
-    none = np.zeros(0)
-    if name in (LINEAR, SLEW_LIMIT):
-        return MirrorEffect(name, linearity, 0.0, none, none, np.zeros((0, 0)))
-    if name in (OTHER, UNRESOLVED):
-        return MirrorEffect(name, linearity, RESIDUAL_SIGMAS * residual_rad, none, none, np.zeros((0, 0)))
-    return MirrorEffect(name, linearity, *_simulate_moves(linearity.fits[name], config, axis))
+    if name in (LINEAR, SLEW_LIMIT, OTHER, UNRESOLVED):
+        error_rad = 0.0 if name in (LINEAR, SLEW_LIMIT) else RESIDUAL_SIGMAS * residual_rad
+        return MirrorEffect(name, linearity, error_rad, np.zeros(0), np.zeros(0), np.zeros((0, 0)))
+    return MirrorEffect(name, linearity, *_simulate_moves(linearity.fits[name].servo, config, axis))
 
 
-def _simulate_moves(fit: FormFit, config: Config, axis: int) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+def _simulate_moves(
+    servo: NonlinearServo, config: Config, axis: int
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
     """Return the error that stays, and sizes [k], times [n] and distances [k, n] of moves across the display."""
-    omega, zeta, delay_s = float(np.exp(fit.base[0])), fit.base[1], fit.base[2]
+    omega, zeta, delay_s = float(np.exp(servo.base[0])), float(servo.base[1]), float(servo.base[2])
     h_s = 1.0 / (2 * STEPS_PER_TIME_CONSTANT * omega)
     slowest = zeta - np.sqrt(zeta * zeta - 1.0) if zeta > 1.0 else zeta
     hold = int(HOLD_TIME_CONSTANTS / (slowest * omega) / h_s)
@@ -267,8 +249,8 @@ def _simulate_moves(fit: FormFit, config: Config, axis: int) -> tuple[float, Flo
             places += [start, start + size, start]
     target = np.array(places)
     begin_s = np.asarray(h_s * hold * np.arange(len(target)), dtype=np.float64)
-    drive = build_drive(fit.form, fit.effect, begin_s, target, (0.0, h_s, len(target) * hold))
-    states = respond(fit.form, fit.effect, fit.base[:2], drive, (h_s, fit.scale))
+    drive = build_drive(servo.form, servo.effect, begin_s, target, (0.0, h_s, len(target) * hold))
+    states = servo.respond(drive, h_s)
     angle = states[:, 0].reshape(len(target), hold)
     # The calibrated field absorbs gain and offset.
     model = np.column_stack([np.ones(len(target)), angle[:, -1]])

@@ -6,19 +6,27 @@ is the ramp lag −2ζ slope / ω plus the free oscillation Re(2 A exp(λ t)).
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, ReadOnlyArrays
 from optodrive.device.gate_timing import pole_per_s, settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.inference.fit import fit_residuals
 from optodrive.lab.servo_identification.effect_fit import Linearity, ServoData, ServoRecord
-from optodrive.lab.servo_identification.effects import FORMS, LINEAR_FORM, SLEW, SLEW_LIMIT
-from optodrive.lab.servo_identification.records import AXES, GAIN_TOLERANCE, Steps, StepTrace, TraceSegment
+from optodrive.lab.servo_identification.effects import (
+    FORMS,
+    LINEAR_FORM,
+    SLEW,
+    SLEW_LIMIT,
+    NonlinearServo,
+    change_command,
+)
+from optodrive.lab.servo_identification.records import AXES, GAIN_TOLERANCE, Steps, StepTrace
 
 LOWER_BOUNDS = np.array([np.log(50.0), 0.05, 0.0, 1e-6])
 UPPER_BOUNDS = np.array([np.log(3e4), 0.999, 0.01, 1.0])
@@ -42,8 +50,14 @@ SLEWS = (1e6, 1000.0, 400.0, 160.0, 70.0, 30.0, 10.0)
 DELAY_SHARES = (0.0, 0.3, 0.6, 0.9)
 
 
+Solved = tuple[FloatArray, float, float]
+"""Residual in units of the noise, gain and offset."""
+Solve = Callable[[FloatArray], Solved]
+"""Function of the packed parameters."""
+
+
 @dataclass(frozen=True, eq=False)
-class IdentifiedServo:
+class IdentifiedServo(ReadOnlyArrays):
     """The identified servo of a mirror.
 
     covariance: [4, 4] of log frequency, damping, delay (s), 1/slew (s/rad)
@@ -59,9 +73,6 @@ class IdentifiedServo:
     misfit: float
     slew_identified: bool
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
     @property
     def residual_rad(self) -> float:
         """Rms residual of the angles, weighted by their noise, rad."""
@@ -70,8 +81,7 @@ class IdentifiedServo:
     @property
     def sigma(self) -> FloatArray:
         """Standard deviation of each parameter, [4]."""
-        sigma: FloatArray = np.sqrt(np.diag(self.covariance))
-        return sigma
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=np.float64)
 
     def sample_servos(self) -> list[Servo]:
         """Return SERVO_SAMPLES servos sampled from the covariance."""
@@ -93,22 +103,16 @@ def identify(where: str, trace: StepTrace, assumed_slew_rad_per_s: float) -> Ide
     Raise InputError, naming `where`, if sampling or noise do not permit an identification.
     """
     start_trace, fit_trace = _decimate(trace, START_SAMPLES_MAX), _decimate(trace, FIT_SAMPLES_MAX)
-    free = np.full(4, True)
-    starts = sorted(_generate_starts(trace), key=lambda start: float((_residual(start_trace, start)[0] ** 2).sum()))[
-        :STARTS_REFINED
-    ]
-    initial = min((_fit(start_trace, start, free) for start in starts), key=lambda found: found[1])[0]
-    best, _, covariance = _fit(fit_trace, initial, free)
+    free, solve_start, solve = np.full(4, True), partial(_residual, start_trace), partial(_residual, fit_trace)
+    starts = sorted(_generate_starts(trace), key=lambda start: float((solve_start(start)[0] ** 2).sum()))
+    initial = min((_fit(solve_start, start, free) for start in starts[:STARTS_REFINED]), key=lambda found: found[1])[0]
+    best, _, covariance = _fit(solve, initial, free)
     slew_identified = bool(best[3] > SLEW_SIGMAS_MIN * np.sqrt(covariance[3, 3]))
     if not slew_identified and abs(1.0 / assumed_slew_rad_per_s - best[3]) < 3.0 * np.sqrt(covariance[3, 3]):
         free[3] = False
         best[3] = 1.0 / assumed_slew_rad_per_s
-        best, _, covariance = _fit(fit_trace, best, free)
-    residual, gain, offset_rad = _residual(fit_trace, best)
-    misfit = float(np.sqrt((residual**2).mean()))
-    found = IdentifiedServo(trace, _unpack(best), covariance, gain, offset_rad, misfit, slew_identified)
-    _check_identifiable(f"{where}: mirror_{AXES[trace.axis]}_rad", found)
-    return found
+        best, _, covariance = _fit(solve, best, free)
+    return _build(where, trace, solve, best, covariance, slew_identified)
 
 
 def identify_excitation(
@@ -120,47 +124,43 @@ def identify_excitation(
     """
     limited = found.probability[SLEW_LIMIT] > 0.5
     start = found.fits[SLEW_LIMIT]
-    base = np.array(start.base) if limited else found.linear
+    base = start.servo.base if limited else found.linear
     data = ServoData(records, float(np.exp(base[0])))
     stride = max(1, len(data.target) // FIT_SAMPLES_MAX)
-    constant = np.concatenate([np.full(each.use.sum(), 1.0 / each.noise) for each in records])[::stride]
     form = next(each for each in FORMS if each.kind == SLEW) if limited else LINEAR_FORM
-    y = data.target[::stride]
 
-    def solve(packed: FloatArray) -> tuple[FloatArray, float, float]:
+    def solve(packed: FloatArray) -> Solved:
         servo = _unpack(packed)
         core = np.array([np.log(2.0 * np.pi * servo.frequency), servo.damping, servo.delay])
-        model = np.column_stack([constant, data.simulate(form, core, (servo.slew, 1.0), 1.0, 1, stride)])
-        offset, gain = np.linalg.lstsq(model, y, rcond=None)[0]
-        return np.asarray(y - model @ [offset, gain]), float(gain), float(offset)
+        return data.compare(NonlinearServo(form, core, (servo.slew, 1.0)), stride)
 
     frequency = float(np.exp(base[0])) / (2.0 * np.pi)
-    slew = start.effect[0] if limited else assumed_slew_rad_per_s
+    slew = start.servo.effect[0] if limited else assumed_slew_rad_per_s
     packed = _pack(Servo(frequency, float(base[1]), float(base[2]), slew))
     free = np.array([True, True, True, limited])
-    best, _, covariance = _fit_residual(lambda each: solve(each)[0], packed, free)
-    residual, gain, offset_rad = solve(best)
-    segments = tuple(TraceSegment(Steps(each.at_s, each.command), each.t_s, each.value, each.noise) for each in records)
-    spacing_s = float(np.median(np.concatenate([np.diff(each.t_s) for each in records])))
-    trace = StepTrace(axis, segments, spacing_s)
-    misfit = float(np.sqrt((residual**2).mean()))
-    servo = IdentifiedServo(trace, _unpack(best), covariance, gain, offset_rad, misfit, limited)
+    best, _, covariance = _fit(solve, packed, free)
+    gain = solve(best)[1]
     if abs(gain - 1.0) > GAIN_TOLERANCE:
-        expected = (
-            f"within {GAIN_TOLERANCE:.0%} of 1: the mirror's mechanical angle in rad, axes not exchanged or inverted"
-        )
+        angle = "the mirror's mechanical angle in rad, axes not exchanged or inverted"
+        expected = f"within {GAIN_TOLERANCE:.0%} of 1: {angle}"
         raise InputError(f"{where}: mirror_{AXES[axis]}_rad", f"{gain:.2g} times the {AXES[axis]} commands", expected)
-    _check_identifiable(f"{where}: mirror_{AXES[axis]}_rad", servo)
-    return servo
+    return _build(where, StepTrace(axis, tuple(records)), solve, best, covariance, limited)
 
 
-def _check_identifiable(where: str, found: IdentifiedServo) -> None:
-    spacing_s, servo = found.trace.spacing_s, found.servo
+def _build(
+    where: str, trace: StepTrace, solve: Solve, best: FloatArray, covariance: FloatArray, slew_identified: bool
+) -> IdentifiedServo:
+    """Return the servo of the best parameters. Raise InputError if it is not identifiable."""
+    residual, gain, offset_rad = solve(best)
+    misfit = float(np.sqrt((residual**2).mean()))
+    found = IdentifiedServo(trace, _unpack(best), covariance, gain, offset_rad, misfit, slew_identified)
+    spacing_s, servo = trace.spacing_s, found.servo
     if servo.frequency * spacing_s > SAMPLE_SPACING_MAX or 2.0 * found.sigma[0] > FREQUENCY_UNCERTAINTY_MAX:
         spacing, frequency = format_quantity(spacing_s, "s"), format_quantity(servo.frequency, "Hz")
         sampled = f"{spacing} a sample, {frequency} ± {2 * found.sigma[0]:.1%}"
         expected = "finer sampling or more steps: the sampling is too coarse, or the noise too high, for this servo"
-        raise InputError(where, sampled, expected)
+        raise InputError(f"{where}: mirror_{AXES[trace.axis]}_rad", sampled, expected)
+    return found
 
 
 def _unpack(packed: FloatArray) -> Servo:
@@ -171,28 +171,21 @@ def _pack(servo: Servo) -> FloatArray:
     return np.array([np.log(servo.frequency), servo.damping, servo.delay, 1.0 / servo.slew])
 
 
-def _residual(trace: StepTrace, packed: FloatArray) -> tuple[FloatArray, float, float]:
+def _residual(trace: StepTrace, packed: FloatArray) -> Solved:
     """Return the residual in units of the noise, with the gain and offset that minimise it."""
-    servo = _unpack(packed)
-    model = np.concatenate([step_response_rad(servo, piece.steps, piece.t_s) for piece in trace.segments])
-    value = np.concatenate([piece.value_rad for piece in trace.segments])
-    noise_rad = np.concatenate([np.full(len(piece.t_s), piece.noise_rad) for piece in trace.segments])
-    weight = noise_rad**-2.0 / (noise_rad**-2.0).sum()
+    servo, value = _unpack(packed), trace.value
+    model = np.concatenate([step_response_rad(servo, Steps(run.at_s, run.command), run.t_s) for run in trace.runs])
+    weight = trace.noise**-2.0 / (trace.noise**-2.0).sum()
     model_mean, mean = float(weight @ model), float(weight @ value)
     around = model - model_mean
     gain = float((weight * around) @ (value - mean) / max(float((weight * around) @ around), 1e-300))
-    return (value - mean - gain * around) / noise_rad, gain, mean - gain * model_mean
+    return (value - mean - gain * around) / trace.noise, gain, mean - gain * model_mean
 
 
-def _fit(trace: StepTrace, start: FloatArray, free: BoolArray) -> tuple[FloatArray, float, FloatArray]:
-    return _fit_residual(lambda packed: _residual(trace, packed)[0], start, free)
-
-
-def _fit_residual(
-    compute: Callable[[FloatArray], FloatArray], start: FloatArray, free: BoolArray
-) -> tuple[FloatArray, float, FloatArray]:
+def _fit(solve: Solve, start: FloatArray, free: BoolArray) -> tuple[FloatArray, float, FloatArray]:
     """Fit from a starting point. Return parameters, cost, and covariance with zeros for fixed parameters."""
-    found = fit_residuals(compute, start, (LOWER_BOUNDS, UPPER_BOUNDS), DERIVATIVE_STEPS, free=free, evaluations=80)
+    bounds = LOWER_BOUNDS, UPPER_BOUNDS
+    found = fit_residuals(lambda x: solve(x)[0], start, bounds, DERIVATIVE_STEPS, free=free, evaluations=80)
     degrees_of_freedom = max(1, len(found.residual) - int(free.sum()) - 2)
     return found.x, 0.5 * found.chi2, found.covariance * (found.chi2 / degrees_of_freedom)
 
@@ -206,67 +199,41 @@ def _generate_starts(trace: StepTrace) -> Iterator[FloatArray]:
 def _rise_s(trace: StepTrace) -> float:
     """Return the median time in which the mirror covers a tenth of a step, s, an upper bound of the delay."""
     shortest_s = []
-    for piece in trace.segments:
-        steps = piece.steps
-        for row in range(1, len(steps.at_s)):
-            step_rad = steps.command_rad[row] - steps.command_rad[row - 1]
-            begin, end = np.searchsorted(piece.t_s, [steps.at_s[row], steps.at_s[row] + 0.01])
-            progress = (piece.value_rad[begin:end] - steps.command_rad[row - 1]) / step_rad
+    for run in trace.runs:
+        for row in range(1, len(run.at_s)):
+            step_rad = run.command[row] - run.command[row - 1]
+            begin, end = np.searchsorted(run.t_s, [run.at_s[row], run.at_s[row] + 0.01])
+            progress = (run.value[begin:end] - run.command[row - 1]) / step_rad
             reached = np.flatnonzero(progress > 0.1)
             if len(reached):
-                shortest_s.append(piece.t_s[begin + reached[0]] - steps.at_s[row])
+                shortest_s.append(run.t_s[begin + reached[0]] - run.at_s[row])
     return float(np.median(shortest_s)) if shortest_s else 1e-4
 
 
 def _decimate(trace: StepTrace, max_samples: int) -> StepTrace:
     """Decimate a trace evenly to about max_samples."""
-    stride = -(-sum(len(piece.t_s) for piece in trace.segments) // max_samples)
-    pieces = tuple(
-        TraceSegment(each.steps, each.t_s[::stride], each.value_rad[::stride], each.noise_rad)
-        for each in trace.segments
-    )
-    return replace(trace, segments=pieces)
+    part = slice(None, None, -(-len(trace.value) // max_samples))
+    runs = (replace(run, t_s=run.t_s[part], value=run.value[part], use=run.use[part]) for run in trace.runs)
+    return replace(trace, runs=tuple(runs))
 
 
 def step_response_rad(servo: Servo, steps: Steps, t_s: FloatArray) -> FloatArray:
     """Return the angle at t_s, rad, from steady state at the first command. The damping must be below 1."""
     pole = pole_per_s(servo)
     ramp_lag_s = -2.0 * servo.damping / (2.0 * np.pi * servo.frequency)
-    breakpoints = _find_breakpoints(servo, steps)
-    modes = np.empty(len(breakpoints), dtype=np.complex128)
-    angle, speed = breakpoints[0][1], 0.0
-    for row, (at_s, target, slope) in enumerate(breakpoints):
-        error, rate = angle - target - ramp_lag_s * slope, speed - slope
+    begin_s, target, slope = change_command(SLEW, (servo.slew, 1.0), steps.at_s + servo.delay, steps.command_rad)
+    modes = np.empty(len(target), dtype=np.complex128)
+    angle, speed = target[0], 0.0
+    for row in range(len(target)):
+        error, rate = angle - target[row] - ramp_lag_s * slope[row], speed - slope[row]
         # e = 2 Re(A), e' = 2 Re(λ A)
         modes[row] = mode = 0.5 * complex(error, (pole.real * error - rate) / pole.imag)
-        if row + 1 < len(breakpoints):
-            later_s = breakpoints[row + 1][0] - at_s
+        if row + 1 < len(target):
+            later_s = begin_s[row + 1] - begin_s[row]
             transient = 2.0 * mode * np.exp(pole * later_s)
-            angle = target + slope * (later_s + ramp_lag_s) + transient.real
-            speed = slope + (pole * transient).real
-    begin_s, target, slope = np.array(breakpoints).T
+            angle = target[row] + slope[row] * (later_s + ramp_lag_s) + transient.real
+            speed = slope[row] + (pole * transient).real
     row_of = np.clip(np.searchsorted(begin_s, t_s, side="right") - 1, 0, None)
     since_s = np.maximum(t_s - begin_s[row_of], 0.0)
     transient = 2.0 * (modes[row_of] * np.exp(pole * since_s)).real
-    response: FloatArray = target[row_of] + slope[row_of] * (since_s + ramp_lag_s) + transient
-    return response
-
-
-def _find_breakpoints(servo: Servo, steps: Steps) -> list[tuple[float, float, float]]:
-    """Return the breakpoints of the slew-limited target: time, target, and slope after it."""
-    at_s, command = (steps.at_s + servo.delay).tolist(), steps.command_rad.tolist()
-    target = command[0]
-    breakpoints = [(at_s[0], target, 0.0)]
-    for row in range(1, len(at_s)):
-        step_rad, end_s = command[row] - target, at_s[row + 1] if row + 1 < len(at_s) else np.inf
-        if step_rad == 0.0:
-            breakpoints.append((at_s[row], target, 0.0))
-            continue
-        slope, reached_s = (servo.slew if step_rad > 0.0 else -servo.slew), at_s[row] + abs(step_rad) / servo.slew
-        breakpoints.append((at_s[row], target, slope))
-        if reached_s < end_s:
-            target = command[row]
-            breakpoints.append((reached_s, target, 0.0))
-        else:
-            target += slope * (end_s - at_s[row])
-    return breakpoints
+    return np.asarray(target[row_of] + slope[row_of] * (since_s + ramp_lag_s) + transient, dtype=np.float64)

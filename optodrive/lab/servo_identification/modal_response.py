@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq, least_squares
 
-from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, ReadOnlyArrays
 
 MODES_MAX = 16
 """Largest number of modes that move with the amplitude."""
@@ -62,7 +62,7 @@ def find_exponent(lag: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class ModalResponse:
+class ModalResponse(ReadOnlyArrays):
     """A response with modes that move.
 
     poles: [m] λ of the modes that move, rad/s, one of each pair; fixed: [k] of the others; changes: [m] c;
@@ -77,9 +77,6 @@ class ModalResponse:
     changes: Any
     gains: Any
     residues: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @property
     def number_count(self) -> int:
@@ -101,8 +98,7 @@ class ModalResponse:
         level, spectrum = np.sqrt((u**2).mean(axis=(0, 1))), np.fft.rfft(u, axis=0)
         frequency_hz: FloatArray = np.arange(len(spectrum), dtype=np.float64) * (self.rate_hz / len(u))
         parts = [self.at(float(each), frequency_hz) @ spectrum[:, :, [row]] for row, each in enumerate(level)]
-        answer: FloatArray = np.fft.irfft(np.concatenate(parts, axis=2), len(u), axis=0)
-        return answer
+        return np.asarray(np.fft.irfft(np.concatenate(parts, axis=2), len(u), axis=0), dtype=np.float64)
 
     def list_poles(self, level: float) -> Any:
         """Return λ of all modes at an amplitude, [m + k], rad/s."""
@@ -111,8 +107,7 @@ class ModalResponse:
     def measure_ringing(self, level: float, outputs: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return the largest ringing of each mode, [m + k], in outputs [a, o] after a step of inputs [i, a]."""
         ends = self._pair_residues() / (1.0 - np.exp(self.list_poles(level) / self.rate_hz))[:, None, None]
-        ringing: FloatArray = 2.0 * np.abs(outputs @ ends @ inputs).max(axis=(1, 2))
-        return ringing
+        return np.asarray(2.0 * np.abs(outputs @ ends @ inputs).max(axis=(1, 2)), dtype=np.float64)
 
     def respond_to_step(self, level: float, count: int, rings: BoolArray) -> FloatArray:
         """Return the outputs at each of count samples after a unit step of each input from rest, [count, o, i].
@@ -124,8 +119,7 @@ class ModalResponse:
         decays = np.where(rings, poles, 0.0) ** np.arange(count)[:, None]
         modes = np.tensordot((1.0 - np.where(rings, decays, 0.0)) / (1.0 - poles), self._pair_residues(), axes=1)
         direct = self.residues[-2] + self.residues[-1] * (np.arange(count) > 0)[:, None, None]
-        outputs: FloatArray = (2.0 * modes.real + direct) * (1.0 + self.gains.real * self._law(level))
-        return outputs
+        return np.asarray((2.0 * modes.real + direct) * (1.0 + self.gains.real * self._law(level)), dtype=np.float64)
 
     def _pair_residues(self) -> Any:
         """Return R of each mode's first pole, [m + k, o, i]."""
@@ -145,8 +139,7 @@ def _build_columns(z: Any, poles: Any) -> Any:
 
 def _stack(values: Any) -> FloatArray:
     """Return real and imaginary parts below each other."""
-    stacked: FloatArray = np.concatenate([values.real, values.imag])
-    return stacked
+    return np.asarray(np.concatenate([values.real, values.imag]), dtype=np.float64)
 
 
 def fit_poles(z: Any, response: Any, pairs: int) -> Any:
@@ -278,38 +271,26 @@ class _ModalFit:
 
     def compute_residual(self, x: FloatArray) -> FloatArray:
         prior = self.weight * np.ascontiguousarray(self.unpack(x)[1]).view(np.float64)
-        residual: FloatArray = np.concatenate([*(each.rest.ravel() for each in self.project(x)), prior])
-        return residual
+        return np.asarray(np.concatenate([*(each.rest.ravel() for each in self.project(x)), prior]), dtype=np.float64)
 
     def differentiate(self, x: FloatArray) -> FloatArray:
         """Return Kaufman's Jacobian, [rows, parameters]: the residues' own change is projected out."""
         logs, changes, gains = self.unpack(x)
-        columns, blocks = self._columns_by_level(x), []
+        columns, law, blocks = self._columns_by_level(x), self.law[:, None, None], []
+        # Of each mode and amplitude, [m, a, 1, 1]: the pole in z and its derivative by log λ.
+        poles = np.exp(logs[:, None] + changes[:, None] * self.law)[:, :, None, None] / self.rate_hz
+        at, slope = np.exp(poles), poles * np.exp(poles)
         for row, (part, gain) in enumerate(zip(self.project(x), gains, strict=True)):
-            derivatives = []
             pairs = part.residues[: 2 * len(logs)].reshape(len(logs), 2, -1)
-            for mode, (log, change) in enumerate(zip(logs, changes, strict=True)):
-                residue = pairs[mode, 0] + 1j * pairs[mode, 1]
-                poles = np.exp(log + change * self.law)
-                slopes = np.stack([self._differentiate_mode(pole, residue) for pole in poles])
-                slopes = slopes * (1.0 + gain * self.law)[:, None, None, None]
-                derivatives.append((slopes, slopes * self.law[:, None, None, None]))
+            moved = (pairs[:, 0] + 1j * pairs[:, 1])[:, None, None] * slope
+            first, second = moved / (self.z[:, None] - at) ** 2, moved.conj() / (self.z[:, None] - at.conj()) ** 2
+            by_log = np.stack([first + second, 1j * (first - second)], axis=1) * (1.0 + gain * law)
+            by_log = by_log.reshape(2 * len(logs), *by_log.shape[2:])
             of_gain = np.stack([each @ part.residues * a for each, a in zip(columns, self.law, strict=True)])
-            by_log, by_change = ([each[k] for each in derivatives] for k in (0, 1))
-            flat = [_stack(np.concatenate(each[..., k])) for each in (*by_log, *by_change) for k in (0, 1)]
-            for other in range(len(gains)):
-                flat += [_stack(np.concatenate(of_gain * unit * (other == row))) for unit in (1.0, 1j)]
-            block = np.stack(flat, axis=2)
+            of_gains = [of_gain * unit * (other == row) for other in range(len(gains)) for unit in (1.0, 1j)]
+            block = np.stack([_stack(np.concatenate(each)) for each in (*by_log, *(by_log * law), *of_gains)], axis=2)
             block -= np.tensordot(part.columns, np.tensordot(part.columns, block, axes=(0, 0)), axes=1)
             blocks.append(-block.reshape(-1, len(x)))
         prior = np.zeros((2 * len(changes), len(x)))
         prior[:, 2 * len(logs) : 4 * len(logs)] = self.weight * np.eye(2 * len(changes))
         return np.concatenate([*blocks, prior])
-
-    def _differentiate_mode(self, pole: complex, residue: Any) -> Any:
-        """Return the derivative of a mode by real and imaginary part of log λ, [lines, o, 2]."""
-        at = np.exp(pole / self.rate_hz)
-        slope = at * pole / self.rate_hz
-        first = (residue * slope)[None, :] / ((self.z - at) ** 2)[:, None]
-        second = (residue * slope).conj()[None, :] / ((self.z - at.conjugate()) ** 2)[:, None]
-        return np.stack([first + second, 1j * (first - second)], axis=2)

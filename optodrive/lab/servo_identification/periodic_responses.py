@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from optodrive.core.errors import MISSING, InputError
-from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from optodrive.lab.servo_identification.effect_fit import ServoRecord
 
 HALF_WINDOW, DEGREE = 5, 2
@@ -23,7 +23,7 @@ DIAGONAL_SHARE = 0.95
 
 
 @dataclass(frozen=True, eq=False)
-class PeriodicResponses:
+class PeriodicResponses(ReadOnlyArrays):
     """Steady-state periods, averaged.
 
     u: [n, i, r]; y: [n, o, r]; level: [r] rms of the drive; held_out: [r]; noise: rms of a sample of y;
@@ -38,9 +38,6 @@ class PeriodicResponses:
     noise: float
     angle_per_output: FloatArray | None = None
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
 
 def read_responses(path: Path, sample_rate_hz: float) -> PeriodicResponses:
     """Read u_NAME and y_NAME [n, channels, realisations, periods] of every NAME, the last realisation held out."""
@@ -51,35 +48,26 @@ def read_responses(path: Path, sample_rate_hz: float) -> PeriodicResponses:
         raise InputError(str(path), type(error).__name__, "an .npz file of numbers") from None
     names = sorted(name[2:] for name in arrays if name.startswith("u_"))
     if not names:
-        raise InputError(
-            f"{path}: u_NAME", MISSING, "arrays u_NAME and y_NAME, [samples, channels, realisations, periods]"
-        )
+        expected = "arrays u_NAME and y_NAME, [samples, channels, realisations, periods]"
+        raise InputError(f"{path}: u_NAME", MISSING, expected)
     u, y, held_out, differences = [], [], [], []
     for name in names:
         drive, answer = arrays[f"u_{name}"], arrays.get(f"y_{name}")
-        if (
-            answer is None
-            or answer.ndim != 4
-            or drive.ndim != 4
-            or answer.shape[::2] != drive.shape[::2]
-            or len(answer) < 64
-        ):
+        is_whole = answer is not None and answer.ndim == drive.ndim == 4 and answer.shape[::2] == drive.shape[::2]
+        if answer is None or not is_whole or len(answer) < 64:
             shape = MISSING if answer is None else answer.shape
-            raise InputError(
-                f"{path}: y_{name}", shape, f"the shape of u_{name} {drive.shape} but for channels: four axes"
-            )
+            expected = f"the shape of u_{name} {drive.shape} but for channels: four axes"
+            raise InputError(f"{path}: y_{name}", shape, expected)
         if not np.isfinite(drive).all() or not np.isfinite(answer).all() or drive.shape[2] < 2 or answer.shape[3] < 2:
-            raise InputError(
-                f"{path}: u_{name}, y_{name}", drive.shape, "finite, at least 2 realisations and 2 periods"
-            )
+            expected = "finite, at least 2 realisations and 2 periods"
+            raise InputError(f"{path}: u_{name}, y_{name}", drive.shape, expected)
         u.append(drive.mean(axis=3))
         y.append(answer.mean(axis=3))
         held_out += [False] * (drive.shape[2] - 1) + [True]
         differences.append(np.var(answer - answer.mean(axis=3, keepdims=True), ddof=0) / (answer.shape[3] - 1))
     if len({(each.shape[0], each.shape[1]) for each in u}) > 1 or len({each.shape[1] for each in y}) > 1:
-        raise InputError(
-            f"{path}: u_NAME", [each.shape for each in u], "the same samples and channels at every amplitude"
-        )
+        expected = "the same samples and channels at every amplitude"
+        raise InputError(f"{path}: u_NAME", [each.shape for each in u], expected)
     drives = np.concatenate(u, axis=2)
     level = np.sqrt((drives**2).mean(axis=(0, 1)))
     noise = float(np.sqrt(np.mean(differences)))
@@ -104,9 +92,8 @@ def fit_response(responses: PeriodicResponses, rows: BoolArray) -> Any:
         inside = np.flatnonzero((np.arange(count) + shift >= 0) & (np.arange(count) + shift < count))
         share = 1.0 - abs(shift) / (HALF_WINDOW + 1)
         powers = (shift / HALF_WINDOW) ** np.arange(DEGREE + 1)
-        block = (
-            moments[inside + shift][:, None, :, None, :] * (share * np.outer(powers, powers))[None, :, None, :, None]
-        )
+        weights = (share * np.outer(powers, powers))[None, :, None, :, None]
+        block = moments[inside + shift][:, None, :, None, :] * weights
         left[inside] += block.reshape(len(inside), wide, wide)
         right[inside] += np.concatenate([share * power * products[inside + shift] for power in powers], axis=2)
     ridge = 1e-12 * np.einsum("lii->l", left).real[:, None, None] * np.eye(wide)

@@ -5,11 +5,13 @@ Steps identify a servo; records of any excitation, with the noise and what is he
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from optodrive.core.errors import MISSING, InputError
-from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.measurements import Measurement, Run
 from optodrive.lab.servo_identification.effect_fit import ServoRecord
 
@@ -44,66 +46,52 @@ def is_dense(changes_s: FloatArray) -> bool:
     return len(changes_s) > 2 and float(np.median(np.diff(changes_s))) < DENSE_HOLD_S
 
 
-@dataclass(frozen=True, eq=False)
-class Steps:
+class Steps(NamedTuple):
     """Commands of one mirror, all [k]: command_rad from at_s (s) on. The first one holds from the beginning."""
 
     at_s: FloatArray
     command_rad: FloatArray
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
-    @property
-    def sizes_rad(self) -> FloatArray:
-        """Absolute size of each step, rad, [k − 1]."""
-        sizes: FloatArray = np.abs(np.diff(self.command_rad))
-        return sizes
-
-
-@dataclass(frozen=True, eq=False)
-class TraceSegment:
-    """One run of one mirror: its commands, and its measured angles value_rad at t_s, [m].
-
-    noise_rad: rms noise of a sample, from settled samples; runs may have different measuring ranges
-    """
-
-    steps: Steps
-    t_s: FloatArray
-    value_rad: FloatArray
-    noise_rad: float
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
 
 @dataclass(frozen=True, eq=False)
 class StepTrace:
-    """All runs of one mirror.
+    """All runs of one mirror. Runs may have different measuring ranges, so each has its own noise.
 
     axis: 0 for x, 1 for y
-    spacing_s: median time between samples
     """
 
     axis: int
-    segments: tuple[TraceSegment, ...]
-    spacing_s: float
+    runs: tuple[ServoRecord, ...]
 
     @property
     def is_dense(self) -> bool:
         """Whether the commands are an excitation rather than steps."""
-        return any(is_dense(piece.steps.at_s) for piece in self.segments)
+        return any(is_dense(run.at_s) for run in self.runs)
+
+    @cached_property
+    def spacing_s(self) -> float:
+        """Median time between samples."""
+        return float(np.median(np.concatenate([np.diff(run.t_s) for run in self.runs])))
+
+    @cached_property
+    def value(self) -> FloatArray:
+        """Angles of all samples, rad."""
+        return np.concatenate([run.value for run in self.runs])
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """Rms noise of each sample, rad."""
+        return np.concatenate([np.full(len(run.t_s), run.noise) for run in self.runs])
 
     @property
     def noise_rad(self) -> float:
         """Rms noise of all samples, rad."""
-        squares = sum(piece.noise_rad**2 * len(piece.t_s) for piece in self.segments)
-        return float(np.sqrt(squares / sum(len(piece.t_s) for piece in self.segments)))
+        return float(np.sqrt((self.noise**2).mean()))
 
     @property
     def steps_rad(self) -> FloatArray:
         """Sizes of all steps, [k]."""
-        return np.concatenate([piece.steps.sizes_rad for piece in self.segments])
+        return np.concatenate([np.abs(np.diff(run.command)) for run in self.runs])
 
 
 def extract_trace(where: str, measurement: Measurement, axis: int) -> StepTrace:
@@ -111,24 +99,22 @@ def extract_trace(where: str, measurement: Measurement, axis: int) -> StepTrace:
     name = f"mirror_{AXES[axis]}_rad"
     runs = [run for run in measurement.runs if name in run.signals and run.commands is not None and len(run.commands)]
     if not runs:
-        raise InputError(
-            f"{where}: {name}", MISSING, "a run with this signal and commands: the mirror's measured angle"
-        )
-    steps_left, segments = STEPS_MAX, []
+        expected = "a run with this signal and commands: the mirror's measured angle"
+        raise InputError(f"{where}: {name}", MISSING, expected)
+    steps_left, found = STEPS_MAX, []
     for run in runs:
-        segment = _extract_segment(run, axis, steps_left)
-        if segment is not None:
-            segments.append(segment)
-            steps_left -= len(segment.steps.sizes_rad)
-    steps = sum(len(piece.steps.sizes_rad) for piece in segments)
-    if steps < STEPS_MIN:
-        raise InputError(f"{where}: {name}", f"{steps} steps of {AXES[axis]} in commands", f"at least {STEPS_MIN}")
+        record = _extract_steps(run, axis, steps_left)
+        if record is not None:
+            found.append(record)
+            steps_left -= len(record.command) - 1
+    if STEPS_MAX - steps_left < STEPS_MIN:
+        count = f"{STEPS_MAX - steps_left} steps of {AXES[axis]} in commands"
+        raise InputError(f"{where}: {name}", count, f"at least {STEPS_MIN}")
     _check_following(f"{where}: {name}", runs, axis)
-    spacing_s = float(np.median(np.concatenate([np.diff(piece.t_s) for piece in segments])))
-    return StepTrace(axis, tuple(segments), spacing_s)
+    return StepTrace(axis, tuple(found))
 
 
-def _extract_segment(run: Run, axis: int, steps_left: int) -> TraceSegment | None:
+def _extract_steps(run: Run, axis: int, steps_left: int) -> ServoRecord | None:
     """Extract up to steps_left steps of a run and the samples near them. Return None for a run without steps."""
     signal, commands = run.signals[f"mirror_{AXES[axis]}_rad"], run.commands
     assert commands is not None  # noqa: S101
@@ -148,16 +134,18 @@ def _extract_segment(run: Run, axis: int, steps_left: int) -> TraceSegment | Non
     since_s = t_s - np.concatenate([[steps.at_s[1] - WINDOW_S], steps.at_s[1:]])[step_index]
     near = (since_s <= WINDOW_S) & (since_s >= 0.0) & (t_s < end_s)
     t_s, value_rad = t_s[near], value_rad[near]
-    return TraceSegment(steps, t_s, value_rad, _noise_rad(steps, t_s, value_rad)) if len(t_s) > 2 else None
+    if len(t_s) <= 2:
+        return None
+    noise_rad = _noise_rad(steps, t_s, value_rad)
+    return ServoRecord(*steps, t_s, value_rad, np.ones(len(t_s), dtype=np.bool_), False, noise_rad)
 
 
-def _find_settled_rows(at_s: FloatArray, t_s: FloatArray) -> FloatArray:
+def _find_settled_rows(at_s: FloatArray, t_s: FloatArray) -> IntArray:
     """Return the command's row for samples late in their hold, −1 for others, [m]."""
     row = np.clip(np.searchsorted(at_s, t_s, side="right") - 1, 0, None)
     end_s = np.append(at_s[1:], max(t_s[-1], at_s[-1]))
     late = t_s >= at_s[row] + 0.75 * (end_s[row] - at_s[row])
-    rows: FloatArray = np.where(late, row, -1)
-    return rows
+    return np.where(late, row, -1)
 
 
 def _check_following(where: str, runs: list[Run], axis: int) -> None:
@@ -194,9 +182,8 @@ def _check_following(where: str, runs: list[Run], axis: int) -> None:
         raise InputError(where, found, f"an angle that increases with {own_axis}_rad: axis inverted")
     if abs(own_gain - 1.0) > GAIN_TOLERANCE:
         unit = ": degrees?" if 40.0 < own_gain < 75.0 else ": optical angles?" if 1.7 < own_gain < 2.3 else ""
-        raise InputError(
-            where, found, f"the mirror's mechanical angle in rad, within {GAIN_TOLERANCE:.0%} of the command{unit}"
-        )
+        expected = f"the mirror's mechanical angle in rad, within {GAIN_TOLERANCE:.0%} of the command{unit}"
+        raise InputError(where, found, expected)
 
 
 def _noise_rad(steps: Steps, t_s: FloatArray, value_rad: FloatArray) -> float:
@@ -204,7 +191,7 @@ def _noise_rad(steps: Steps, t_s: FloatArray, value_rad: FloatArray) -> float:
     row = _find_settled_rows(steps.at_s, t_s)
     second_differences = np.abs(np.diff(value_rad, 2)[(row[:-2] == row[2:]) & (row[:-2] >= 0)])
     sigma_rad = 1.4826 * float(np.median(second_differences)) / np.sqrt(6.0) if len(second_differences) else 0.0
-    return max(sigma_rad, NOISE_MIN * float(steps.sizes_rad.mean()))
+    return max(sigma_rad, NOISE_MIN * float(np.abs(np.diff(steps.command_rad)).mean()))
 
 
 def is_excitation(measurement: Measurement, axis: int) -> bool:
@@ -219,9 +206,8 @@ def extract_records(where: str, measurement: Measurement, axis: int) -> list[Ser
     The last run of each amplitude is held out, or the middle amplitude if each was recorded once.
     """
     name = f"mirror_{AXES[axis]}_rad"
-    runs = [
-        run for run in measurement.runs if name in run.signals and run.commands is not None and _level(run, axis) > 0.0
-    ]
+    measured = (run for run in measurement.runs if name in run.signals and run.commands is not None)
+    runs = [run for run in measured if _level(run, axis) > 0.0]
     if not runs:
         raise InputError(f"{where}: {name}", MISSING, "a run with this signal and commands that move this mirror")
     levels = _group_levels(runs, axis)

@@ -43,17 +43,9 @@ def build_report(
     """Build the report in SI units. Intervals are 95 %."""
     axes = [_axis_report(mirror, config, effect.linearity) for mirror, effect in zip(mirrors, effects, strict=True)]
     half_widths = dict(zip(HALF_WIDTHS, find_half_widths(mirrors, common.servo), strict=True))
-    remarks = [
-        remark
-        for mirror, axis in zip(mirrors, axes, strict=True)
-        for remark in _axis_remarks(mirror, axis["settling"], config)
-    ]
-    remarks += _common_servo_remarks(mirrors, common)
-    remarks += [
-        remark
-        for row, effect in enumerate(effects)
-        for remark in _effect_remarks(row, effect, config.tolerance_rad[row])
-    ]
+    own = (_axis_remarks(mirror, axis["settling"], config) for mirror, axis in zip(mirrors, axes, strict=True))
+    of_effects = (_effect_remarks(row, effect, config.tolerance_rad[row]) for row, effect in enumerate(effects))
+    remarks = [remark for part in (*own, _common_servo_remarks(mirrors, common), *of_effects) for remark in part]
     return {
         "scanner": scanner_table(common.servo) | half_widths,
         "galvo": {"share": common.galvo_share},
@@ -73,7 +65,7 @@ def report_linearity(linearity: Linearity) -> dict[str, Any]:
         "sentences": lines,
         "probability": linearity.probability,
         "misfit": {name: float(np.sqrt(each.misfit2)) for name, each in linearity.fits.items()},
-        "form": {name: each.form.name for name, each in linearity.fits.items()},
+        "form": {name: each.servo.form.name for name, each in linearity.fits.items()},
         "gain": linearity.gain,
     }
 
@@ -82,9 +74,8 @@ def describe_linearity(report: dict[str, Any]) -> list[str]:
     """Return the claim, and how well the form that it names fits, as lines."""
     headline, *reasons = report["sentences"]
     misfit = report["misfit"]
-    fits = [
-        f"{report['form'][name]}: {misfit[name]:.3g} × noise, linear {misfit[LINEAR]:.3g}" for name in report["effects"]
-    ]
+    fitted = ((report["form"][name], misfit[name]) for name in report["effects"])
+    fits = [f"{form}: {own:.3g} × noise, linear {misfit[LINEAR]:.3g}" for form, own in fitted]
     if report["effects"] == [SLEW_LIMIT]:
         # A slew limit is part of every servo: the name is no call for action.
         headline += " The identified servo states it."
@@ -104,12 +95,8 @@ def _effect_remarks(row: int, effect: MirrorEffect, tolerance_rad: float) -> lis
 
 def scanner_table(servo: Servo) -> dict[str, float]:
     """Return a servo under the keys of the configuration's [scanner]."""
-    return {
-        "bandwidth_hz": servo.frequency,
-        "damping": servo.damping,
-        "delay_s": servo.delay,
-        "slew_rad_per_s": servo.slew,
-    }
+    stated = servo.frequency, servo.damping, servo.delay, servo.slew
+    return dict(zip(("bandwidth_hz", "damping", "delay_s", "slew_rad_per_s"), stated, strict=True))
 
 
 def format_report_lines(report: dict[str, Any]) -> list[str]:
@@ -138,15 +125,8 @@ def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
     """Write mirrors.toml atomically. source: description of the recording."""
     printable = "".join(letter for letter in source if letter.isprintable() and letter not in '"\\')
     effect = report["effect"]
-    text = [
-        f'format = "{MIRRORS_FORMAT}"',
-        f"version = {MIRRORS_VERSION}",
-        "",
-        "[about]",
-        f'source = "{printable}"',
-        "",
-    ]
-    text += ["[scanner] # for both mirrors, instead of the configuration's", *_format_pairs(report["scanner"])]
+    text = [f'format = "{MIRRORS_FORMAT}"', f"version = {MIRRORS_VERSION}", "", "[about]", f'source = "{printable}"']
+    text += ["", "[scanner] # for both mirrors, instead of the configuration's", *_format_pairs(report["scanner"])]
     text += ["", "[galvo] # factor on the galvo cap, for the faster mirror", *_format_pairs(report["galvo"])]
     if any(error_rad > 0.0 for error_rad in effect["error_rad"]):
         names = ", ".join(f'"{name}"' for name in effect["name"])
@@ -158,10 +138,8 @@ def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
 
 
 def _format_pairs(table: dict[str, Any]) -> list[str]:
-    numbers = {key: value for key, value in table.items() if isinstance(value, int | float)}
-    return [
-        f"{key} = {str(value).lower() if isinstance(value, bool) else repr(value)}" for key, value in numbers.items()
-    ]
+    numbers = ((key, value) for key, value in table.items() if isinstance(value, int | float))
+    return [f"{key} = {str(value).lower() if isinstance(value, bool) else repr(value)}" for key, value in numbers]
 
 
 def _axis_report(mirror: IdentifiedServo, config: Config, linearity: Linearity) -> dict[str, Any]:
@@ -231,50 +209,36 @@ def _describe_settling(row: dict[str, Any]) -> str:
 
 
 def _axis_remarks(mirror: IdentifiedServo, settling: list[dict[str, Any]], config: Config) -> list[str]:
-    name, half_widths, servo = AXES[mirror.trace.axis], INTERVAL_SIGMAS * mirror.sigma, mirror.servo
-    remarks = []
-    if not mirror.slew_identified:
-        configured = config.scanner.slew_rad_per_s
-        remarks.append(
-            f"{name}: the slew is not identified, no step was large enough; the configuration's {configured:g} rad/s "
-            "is kept. Settling times of larger moves depend on it"
-        )
-    if half_widths[0] > BANDWIDTH_TOLERANCE or half_widths[2] > DELAY_TOLERANCE_S:
-        remarks.append(
-            f"{name}: large uncertainty: bandwidth ± {half_widths[0]:.1%}, delay ± {1e6 * half_widths[2]:.1f} µs; "
-            "measure more steps, or sample faster"
-        )
-    if mirror.misfit > MISFIT_MAX:
-        remarks.append(
-            f"{name}: the residual is {mirror.misfit:.1f} times the noise: "
-            "the response is not only a second-order servo with a delay and a slew limit"
-        )
-    if servo.damping + half_widths[1] > CRITICAL_DAMPING:
-        remarks.append(
-            f"{name}: critically damped or overdamped within the uncertainty; a configuration is always underdamped"
-        )
+    half_widths, slew = INTERVAL_SIGMAS * mirror.sigma, config.scanner.slew_rad_per_s
+    is_wide = half_widths[0] > BANDWIDTH_TOLERANCE or half_widths[2] > DELAY_TOLERANCE_S
+    is_critical = mirror.servo.damping + half_widths[1] > CRITICAL_DAMPING
+    spread = f"bandwidth ± {half_widths[0]:.1%}, delay ± {1e6 * half_widths[2]:.1f} µs"
+    no_slew = f"the slew is not identified, no step was large enough; the configuration's {slew:g} rad/s is kept"
+    misfit, parts = f"the residual is {mirror.misfit:.1f} times the noise", "a delay and a slew limit"
+    remarks = [
+        (not mirror.slew_identified, f"{no_slew}. Settling times of larger moves depend on it"),
+        (is_wide, f"large uncertainty: {spread}; measure more steps, or sample faster"),
+        (mirror.misfit > MISFIT_MAX, f"{misfit}: the response is not only a second-order servo with {parts}"),
+        (is_critical, "critically damped or overdamped within the uncertainty; a configuration is always underdamped"),
+    ]
     for row in settling:
         low_s, high_s = row["share"]["interval_s"]
-        if high_s - low_s > 2.0 * SETTLING_TOLERANCE * row["share"]["measured_s"]:
-            remarks.append(
-                f"{name}: a step of {format_quantity(row['step_rad'], 'rad')} settles within {STEP_TOLERANCE:.0%} "
-                f"after {1e3 * low_s:.3f} to {1e3 * high_s:.3f} ms: an overshoot near the tolerance, or too few steps"
-            )
-    return remarks
+        is_open = high_s - low_s > 2.0 * SETTLING_TOLERANCE * row["share"]["measured_s"]
+        step = f"a step of {format_quantity(row['step_rad'], 'rad')} settles within {STEP_TOLERANCE:.0%}"
+        after = f"after {1e3 * low_s:.3f} to {1e3 * high_s:.3f} ms: an overshoot near the tolerance, or too few steps"
+        remarks.append((is_open, f"{step} {after}"))
+    return [f"{AXES[mirror.trace.axis]}: {remark}" for is_due, remark in remarks if is_due]
 
 
 def _common_servo_remarks(mirrors: tuple[IdentifiedServo, IdentifiedServo], common: CommonServo) -> list[str]:
-    remarks = []
     x, y = (asdict(mirror.servo) for mirror in mirrors)
     difference = max(abs(x[key] - y[key]) / max(x[key], y[key], 1e-12) for key in ("frequency", "damping", "slew"))
-    if difference > BANDWIDTH_TOLERANCE or max(common.settling_excess) > SETTLING_TOLERANCE:
-        remarks.append(
-            "one servo model covers both mirrors and settles no sooner than either: at the gate it takes "
-            f"{common.settling_excess[0]:.1%} longer than x and {common.settling_excess[1]:.1%} longer than y"
-        )
-    if common.galvo_share < 1.0 - RELATIVE_TOLERANCE:
-        remarks.append(
-            "the faster mirror accelerates more than that model: "
-            f"the galvo cap is multiplied by {common.galvo_share:.3f}"
-        )
-    return remarks
+    differ = difference > BANDWIDTH_TOLERANCE or max(common.settling_excess) > SETTLING_TOLERANCE
+    longer = " and ".join(
+        f"{each:.1%} longer than {axis}" for each, axis in zip(common.settling_excess, AXES, strict=True)
+    )
+    covers = "one servo model covers both mirrors and settles no sooner than either: at the gate it takes"
+    factor = f"the galvo cap is multiplied by {common.galvo_share:.3f}"
+    remarks = [f"{covers} {longer}"] if differ else []
+    is_faster = common.galvo_share < 1.0 - RELATIVE_TOLERANCE
+    return [*remarks, *([f"the faster mirror accelerates more than that model: {factor}"] if is_faster else [])]

@@ -20,6 +20,7 @@ from optodrive.lab.validation.study import (
 
 SCALED_UNITS = {"m^3/Pa": (1e12, "µL/kPa"), "m^2": (1e6, "mm²")}
 """Units whose prefixes are raised to powers."""
+SIDES = ("nominal", "extended")
 HEADINGS = ("held out", "causes chosen without", "nominal", "extended", "error factor")
 
 
@@ -49,9 +50,8 @@ def describe_findings(result: StudyResult) -> list[str]:
             f"χ² {result.fit.chi2:.1f} with {facts - len(result.named)} degrees of freedom.",
         ]
     if result.unexplained:
-        lines.append(
-            f"Unexplained, by more than {UNEXPLAINED_SIGMA:g} standard errors: {', '.join(result.unexplained)}."
-        )
+        facts_shown = ", ".join(result.unexplained)
+        lines.append(f"Unexplained, by more than {UNEXPLAINED_SIGMA:g} standard errors: {facts_shown}.")
     return [*lines, *_describe_contradictions(result), *_describe_others(result.unchosen)]
 
 
@@ -111,12 +111,8 @@ def build_rows(result: StudyResult) -> list[tuple[str, ...]]:
 def _build_row(item: HeldOutPrediction) -> tuple[str, ...]:
     causes = ", ".join(item.causes) or "none"
     ratios = (" ".join(f"{ratio:.2f}" for ratio in values) for values in (item.nominal, item.extended))
-    return (
-        item.label,
-        causes,
-        *ratios,
-        f"{compute_error_factor(item.nominal):.2f} → {compute_error_factor(item.extended):.2f}",
-    )
+    factors = f"{compute_error_factor(item.nominal):.2f} → {compute_error_factor(item.extended):.2f}"
+    return item.label, causes, *ratios, factors
 
 
 def describe_predictions(result: StudyResult) -> list[str]:
@@ -132,9 +128,8 @@ def describe_predictions(result: StudyResult) -> list[str]:
         if item.unobservable
     ]
     if result.unpredictable:
-        lines.append(
-            f"These fact by fact, the others by groups: error factor {each[0]:.2f} nominal, {each[1]:.2f} extended."
-        )
+        factor = f"error factor {each[0]:.2f} nominal, {each[1]:.2f} extended"
+        lines.append(f"These fact by fact, the others by groups: {factor}.")
     measurements: dict[str, None] = {}
     for cause in result.named:
         if cause.alternatives or len(cause.evidence) == 1:
@@ -149,10 +144,8 @@ def describe_predictions(result: StudyResult) -> list[str]:
 
 def compute_overall_factors(predictions: Sequence[HeldOutPrediction]) -> tuple[float, float]:
     """Return the error factors over all facts, nominal and extended."""
-    nominal = [ratio for item in predictions for ratio in item.nominal]
-    return compute_error_factor(nominal), compute_error_factor(
-        [ratio for item in predictions for ratio in item.extended]
-    )
+    nominal, extended = ([ratio for item in predictions for ratio in getattr(item, side)] for side in SIDES)
+    return compute_error_factor(nominal), compute_error_factor(extended)
 
 
 def describe_assumptions(result: StudyResult) -> list[str]:
@@ -169,6 +162,7 @@ def describe_assumptions(result: StudyResult) -> list[str]:
 def build_study_answer(result: StudyResult) -> dict[str, Any]:
     """Return the result as JSON values, SI units, temperatures as rises, K."""
     groups, each = compute_overall_factors(result.group_predictions), compute_overall_factors(result.predictions)
+    factors = compute_error_factor(result.nominal_ratios), compute_error_factor(result.extended_ratios)
     sides = zip(result.data, result.nominal_ratios, result.extended_ratios, result.errors_sigma, strict=True)
     probable = [keys for keys, probability in result.probabilities.ranked if probability >= MIN_SHOWN]
     return {
@@ -180,24 +174,14 @@ def build_study_answer(result: StudyResult) -> dict[str, Any]:
             "causes": [{"causes": list(keys), "probability": result.probabilities.causes[keys]} for keys in probable],
         },
         "facts": [
-            to_json(datum)
-            | {
-                "relative_error": datum.sigma,
-                "nominal_ratio": nominal,
-                "extended_ratio": extended,
-                "error_sigma": error,
-            }
+            {**to_json(datum), "relative_error": datum.sigma}
+            | {"nominal_ratio": nominal, "extended_ratio": extended, "error_sigma": error}
             for datum, nominal, extended, error in sides
         ],
         "excluded": EXCLUDED,
-        "chi2": {
-            "nominal": result.nominal_fit.chi2,
-            "extended": result.fit.chi2,
-            "degrees_of_freedom": len(result.data) - len(result.named),
-        },
-        "factor": _state_factors(
-            (compute_error_factor(result.nominal_ratios), compute_error_factor(result.extended_ratios))
-        ),
+        "chi2": _state_factors((result.nominal_fit.chi2, result.fit.chi2))
+        | {"degrees_of_freedom": len(result.data) - len(result.named)},
+        "factor": _state_factors(factors),
         "aicc_per_cause": CAUSE_COST,
         "aicc_indistinguishable": AICC_INDISTINGUISHABLE,
         "causes": [_state_cause(item) for item in result.named],
@@ -214,7 +198,7 @@ def build_study_answer(result: StudyResult) -> dict[str, Any]:
 
 
 def _state_factors(factors: tuple[float, float]) -> dict[str, float]:
-    return dict(zip(("nominal", "extended"), factors, strict=True))
+    return dict(zip(SIDES, factors, strict=True))
 
 
 def _state_cause(item: NamedCause | UnchosenCause) -> dict[str, Any]:

@@ -145,12 +145,9 @@ def _closed_form_gas_k(train: TrainStimulus) -> FloatArray:
     start, gate_off_state = _find_steady_state(pixel, FULL_POWER_W, on_s, off_s)
 
     def gas_k(at_s: float) -> float:
-        after = (
-            advance(pixel, *start, FULL_POWER_W, at_s)
-            if at_s <= on_s
-            else advance(pixel, *gate_off_state, 0.0, at_s - on_s)
-        )
-        return after[1]
+        if at_s <= on_s:
+            return advance(pixel, *start, FULL_POWER_W, at_s)[1]
+        return advance(pixel, *gate_off_state, 0.0, at_s - on_s)[1]
 
     return np.array([gas_k(at_s) for at_s in np.linspace(0.0, on_s + off_s, PERIOD_SAMPLES + 1).tolist()])
 

@@ -107,11 +107,8 @@ class StudyResult:
     def predictions(self) -> tuple[HeldOutPrediction, ...]:
         """Predictions with each fact once: held out with its group, or alone where only its group shows a cause."""
         held_out_alone = {name for group in self.unpredictable for name in group.facts}
-        return tuple(
-            item
-            for item in (*self.group_predictions, *self.fact_predictions)
-            if item.label in held_out_alone or not item.unobservable
-        )
+        both = (*self.group_predictions, *self.fact_predictions)
+        return tuple(item for item in both if item.label in held_out_alone or not item.unobservable)
 
     @property
     def untested(self) -> dict[str, str]:
@@ -198,11 +195,8 @@ def _build_named_causes(search: CauseSearch, chosen: CauseFit) -> tuple[NamedCau
     removed, exchanged = search.fit_removals(chosen), search.fit_exchanges(chosen)
     out = []
     for key in chosen.keys:
-        alternatives = [
-            other
-            for (chosen_key, other), fit in exchanged.items()
-            if chosen_key == key and fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE
-        ]
+        own = ((other, fit) for (chosen_key, other), fit in exchanged.items() if chosen_key == key)
+        alternatives = [other for other, fit in own if fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE]
         low, high = chosen.interval(key)
         chi2_reduction = removed[key].chi2 - chosen.chi2
         evidence = _find_evidence(search, removed[key], chosen)
@@ -229,24 +223,14 @@ def _judge_unchosen(search: CauseSearch, chosen: CauseFit) -> tuple[UnchosenCaus
     alone = {key: search.nominal.chi2 - search.fit((key,)).chi2 for key in CAUSES_BY_KEY if key not in chosen.keys}
     probabilities, out = search.weigh(), []
     for key, reduction in sorted(alone.items(), key=lambda item: -item[1]):
-        shares = {
-            mine: (removed[mine].chi2 - fit.chi2) / (removed[mine].chi2 - chosen.chi2)
-            for (mine, other), fit in exchanged.items()
-            if other == key
-        }
+        own = ((mine, removed[mine].chi2, fit) for (mine, other), fit in exchanged.items() if other == key)
+        shares = {mine: (without - fit.chi2) / (without - chosen.chi2) for mine, without, fit in own}
         replaces, fit = max(shares, key=lambda mine: shares[mine], default=""), added.get(key)
         is_law = CAUSES_BY_KEY[key].replaces_law
-        out.append(
-            UnchosenCause(
-                key,
-                probabilities.sum_of(key),
-                None if fit is None else fit.values[key],
-                reduction,
-                0.0 if fit is None else chosen.chi2 - fit.chi2,
-                replaces,
-                shares.get(replaces, 0.0),
-                fit is None or is_law or search.compute_max_chi2_increase(chosen, key) >= CHI2_NOT_OBSERVABLE,
-                fit is not None and is_law and fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE,
-            )
-        )
+        value, added_reduction = (None, 0.0) if fit is None else (fit.values[key], chosen.chi2 - fit.chi2)
+        replaced = replaces, shares.get(replaces, 0.0)
+        is_seen = fit is None or is_law or search.compute_max_chi2_increase(chosen, key) >= CHI2_NOT_OBSERVABLE
+        is_other_law = fit is not None and is_law and fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE
+        judged = value, reduction, added_reduction, *replaced, is_seen, is_other_law
+        out.append(UnchosenCause(key, probabilities.sum_of(key), *judged))
     return tuple(out)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError
-from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.device.config import Config
 from optodrive.device.config_sections import DAC_HALF_RANGE_CODES
@@ -58,7 +58,7 @@ class PointScale(DacScale, bits=12):
 
 
 @dataclass(frozen=True, eq=False)
-class PointPulses:
+class PointPulses(ReadOnlyArrays):
     """Pulses decoded from chunks, all [n]. Times count from the first point and assume no gaps between chunks.
 
     A pulse across the end of a chunk appears as two pulses.
@@ -69,9 +69,6 @@ class PointPulses:
     x_rad: FloatArray
     y_rad: FloatArray
     power_w: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.start_s)

@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError
-from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, IntArray, ReadOnlyArrays
 from optodrive.core.types.plans import LimitedPlan
 
 
@@ -86,7 +86,7 @@ CENTRE_CODE, CODE_MAX = WireScale.CENTRE_CODE, WireScale.CODE_MAX
 
 
 @dataclass(frozen=True, eq=False)
-class WirePoints:
+class WirePoints(ReadOnlyArrays):
     """Points of a plan on the wire.
 
     table: uint16 [n, 5] of the outputs X and Y, gate-off ticks, gate-on ticks and duty
@@ -95,9 +95,6 @@ class WirePoints:
 
     table: np.ndarray[tuple[int, ...], np.dtype[np.uint16]]
     row: IntArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.row)

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, IntArray, ReadOnlyArrays
 from optodrive.core.types.measurements import PixelTrace
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.device.config import Config, build_pixel_layout
@@ -27,7 +27,7 @@ DEAD_GAIN_MAX = 0.04
 
 
 @dataclass(frozen=True, eq=False)
-class GroundTruthPixels:
+class GroundTruthPixels(ReadOnlyArrays):
     """Pixel deviations from the model.
 
     displacement_gain: [p] relative to the model; x_m, y_m: [p] absorber centre from the pixel's centre; dead: indices
@@ -37,9 +37,6 @@ class GroundTruthPixels:
     x_m: FloatArray
     y_m: FloatArray
     dead: IntArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @classmethod
     def sample(cls, seed: int, config: Config) -> Self:

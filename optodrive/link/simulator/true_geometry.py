@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import FloatArray, ReadOnlyArrays
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_sections import HALF_RANGE_CODES
 
@@ -25,7 +25,7 @@ SAMPLES_MAX = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class GroundTruthGeometry:
+class GroundTruthGeometry(ReadOnlyArrays):
     """One geometry. Arrays [2] hold x and y.
 
     nominal_rad_per_code, range_rad: of the DAC; gain, offset_rad, cross, cubic: command to steady mirror angle,
@@ -52,9 +52,6 @@ class GroundTruthGeometry:
     wave_rad: FloatArray
     wave_phase: FloatArray
     wave_m: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @classmethod
     def sample(cls, seed: int, config: Config) -> Self:

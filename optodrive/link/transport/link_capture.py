@@ -17,7 +17,7 @@ from typing import BinaryIO, NamedTuple
 from zlib import crc32
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, refuse_os_error
 from optodrive.link.transport.base import Transport
 
 MAGIC = b"ODWIRE\r\n"
@@ -130,10 +130,8 @@ class LinkCapture:
             raise InputError(f"{path}: start", (self.host_s, self.unix_s), "finite times")
 
     def _open(self) -> BinaryIO:
-        try:
+        with refuse_os_error(self.path, "a file that can be read"):
             return self.path.open("rb")
-        except OSError as error:
-            raise InputError(str(self.path), error.strerror, "a file that can be read") from None
 
     def read_entries(self) -> Iterator[CaptureEntry]:
         """Yield every complete entry in order. Count the bytes after the last one as ignored."""

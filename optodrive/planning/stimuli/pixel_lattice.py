@@ -7,12 +7,12 @@ from itertools import groupby
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.types.arrays import IntArray, freeze_arrays
+from optodrive.core.types.arrays import IntArray, ReadOnlyArrays
 from optodrive.device.config import Config, PixelLayout, build_pixel_layout
 
 
 @dataclass(frozen=True, eq=False)
-class Lattice:
+class Lattice(ReadOnlyArrays):
     """Places of a display's lattice.
 
     index: [rows, columns] pixel at a place, -1 if there is none; layout: the inverse, [p].
@@ -21,9 +21,6 @@ class Lattice:
     name: str
     index: IntArray
     layout: PixelLayout
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @classmethod
     def from_config(cls, config: Config) -> "Lattice":
