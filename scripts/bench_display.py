@@ -8,8 +8,7 @@ from pathlib import Path
 import measuring  # noqa: F401 - the folder of the tests
 
 from display_lab import display_lab  # of the tests
-from optodrive.lab.diagnosis.display_diagnosis import PixelTask, compile_kernels, diagnose_pixel
-from optodrive.lab.diagnosis.pixel_workers import run_tasks
+from optodrive.lab.diagnosis.display_diagnosis import PixelTask, compile_kernels, diagnose_pixel, run_tasks
 from optodrive.lab.recording import DisplayRuns, write_recording
 
 PIXELS, WORKERS = 100, 2

@@ -36,8 +36,8 @@ def diagnose_display(
         PixelTask,
         compile_kernels,
         diagnose_pixel,
+        run_tasks,
     )
-    from optodrive.lab.diagnosis.pixel_workers import run_tasks
 
     start_s = perf_counter()
     tasks = [PixelTask(item.pixel, item.read, seed, config, use) for item in runs.pixels]

@@ -82,8 +82,8 @@ def late(leak):
     """Return the diagnosis with a late clock in place of the leak."""
     size = replace(leak.parameters["gas_leak.rate"], value=-24e-6, unit="s", low=-40e-6, high=-10e-6)
     parameters = {f"clock_offset.{name}": size for name in ("temperature", "displacement", "force", "mirrors")}
-    label = "clock_offset of all signals"
-    return replace(leak, causes=("clock_offset",), hypothesis_labels=(label,), parameters=parameters)
+    rival = replace(leak.rivals[0], label="clock_offset of all signals")
+    return replace(leak, causes=("clock_offset",), rivals=(rival,), parameters=parameters)
 
 
 def measure_planned_errors(found, folder):
@@ -158,7 +158,7 @@ def spread(found, low, high):
         item
         for key in found.causes
         for item in discover_terms()[key].build_hypotheses(scope)
-        if item.label in found.hypothesis_labels
+        if item.label == found.rivals[0].label
     ]
     return replace(found, parameters=parameters, doubts=describe_doubts(hypotheses, parameters))
 

@@ -9,7 +9,7 @@ import pytest
 
 from display_lab import display_lab
 from optodrive.core.types.measurements import Measurement
-from optodrive.lab.diagnosis.pixel_workers import run_tasks
+from optodrive.lab.diagnosis.display_diagnosis import run_tasks
 from optodrive.lab.recording import write_recording
 from rig import OPTODRIVE, is_alive, read_proc, wait_for
 from signalled_processes import SIGNALS, assert_one_line, signalling, wait_for_end

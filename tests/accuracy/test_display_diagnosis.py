@@ -14,14 +14,19 @@ from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.config_file import load_config
-from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelTask, compile_kernels, diagnose_pixel
+from optodrive.lab.diagnosis.display_diagnosis import (
+    DisplayAnswer,
+    PixelTask,
+    compile_kernels,
+    diagnose_pixel,
+    run_tasks,
+)
 from optodrive.lab.diagnosis.display_report import (
     build_display_answer,
     build_display_narrative,
     build_display_report,
     format_ranges,
 )
-from optodrive.lab.diagnosis.pixel_workers import run_tasks
 from optodrive.lab.recording import DisplayRuns, read_recording, write_recording
 
 DROOP = {"laser_droop": {"share": 0.15, "time": 0.05, "spread": 1.0}}

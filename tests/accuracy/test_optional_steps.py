@@ -17,10 +17,9 @@ STEPS = {
     "noise beside an effect": "_revise_noise",
     "held-out runs": "compute_held_out_changes",
     "held-out gain": "compute_held_out_gain",
-    "held-out errors": "compute_held_out_errors",
     "intervals beside other forms": "compute_covariance",
     "the next experiment": "propose_for_verdict",
-    "traces": "ModelComparison",
+    "traces": "trace_groups",
     "error of heights": "compute_height_error",
 }
 DROOP = {"laser_droop": {"share": 0.12, "time": 0.05, "spread": 1.0}}

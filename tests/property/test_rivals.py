@@ -12,7 +12,7 @@ from optodrive.lab.diagnosis.candidate_judgement import NOISE_CHI2, judge_candid
 from optodrive.lab.diagnosis.detection import Detection, Score
 from optodrive.lab.diagnosis.evidence import KNOWN_DEGREES, Explanation, compute_probabilities, compute_score_evidence
 from optodrive.lab.diagnosis.model_selection import Selection
-from optodrive.lab.inference.claim import Claim
+from optodrive.lab.inference.claim import Claim, Evidence
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -57,7 +57,7 @@ def judge(chi2, occam, refitted, noise_degrees, nominal_chi2=1e5):
     ranked = [keys[0] for keys, _ in found.ranked if refitted[KEYS.index(keys[0])]]
     refits = tuple(SimpleNamespace(causes=(key,), hypotheses=(hypotheses[key],), chi2=fits[key]) for key in ranked)
     detection = Detection(scores, SimpleNamespace(), 0.0)
-    selection = Selection(found, refits, {}, detection, nominal_chi2, True, claim=Claim("ambiguous"))
+    selection = Selection(refits, Evidence(found, ()), detection, nominal_chi2, Claim("ambiguous"))
     return {item.cause: item.verdict for item in judge_candidates(selection, {})}, found
 
 
@@ -99,7 +99,7 @@ def test_a_rival_far_behind_is_ruled_out(is_refitted):
 def test_nothing_is_ruled_out_where_nothing_could_be_compared():
     found = Probabilities(0.005, 0.995, dict.fromkeys([(KEYS[0],)], 0.0))
     score = Score(Hypothesis(KEYS[0], KEYS[0], ({},), ()), {}, 500.0, (1.0,), (0,), 1.0, 1.0)
-    selection = Selection(found, (), {}, Detection((score,), SimpleNamespace(), 0.0), 1e5, True)
+    selection = Selection((), Evidence(found, ()), Detection((score,), SimpleNamespace(), 0.0), 1e5)
     assert judge_candidates(selection, {})[0].verdict == "possible"
 
 

@@ -186,17 +186,6 @@ class ResidualTrace:
 
 
 @dataclass(frozen=True, eq=False)
-class ExampleTrace:
-    """The run with the largest or the median error of the nominal model in one signal.
-
-    role: "worst" or "typical"
-    """
-
-    role: str
-    trace: ResidualTrace
-
-
-@dataclass(frozen=True, eq=False)
 class Discrepancy:
     """Diagnosis of a recording.
 
@@ -217,7 +206,6 @@ class Discrepancy:
     causes: tuple[str, ...]
     disturbances: tuple[InstrumentDisturbance, ...]
     probabilities: Probabilities
-    hypothesis_labels: tuple[str, ...]
     parameters: dict[str, Estimate]
     base: dict[str, float]
     terms: dict[str, dict[str, float]]
@@ -227,7 +215,6 @@ class Discrepancy:
     fitted_runs: tuple[str, ...]
     held_out_runs: tuple[str, ...]
     residual_traces: tuple[ResidualTrace, ...]
-    example_traces: tuple[ExampleTrace, ...]
     held_out_traces: tuple[ResidualTrace, ...]
     held_out_errors: tuple[HeldOutError, ...]
     rivals: tuple[RivalModel, ...]

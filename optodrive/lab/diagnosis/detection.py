@@ -16,7 +16,6 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.evidence import compute_form_evidence
 from optodrive.lab.diagnosis.fitting import (
     FitProblem,
-    JitterSensitivity,
     ModelFit,
     compute_jacobian,
     compute_jitter_sensitivity,
@@ -26,6 +25,7 @@ from optodrive.lab.diagnosis.fitting import (
 )
 from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict, record
+from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -176,7 +176,7 @@ def score_effects(
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
     columns = np.column_stack([fitted_columns, candidates / scale, residual])
-    total = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total
+    total = compute_normal_equations(data, columns, problem.noise, sensitivity)
     width = fitted_columns.shape[1]
     # The base parameters have a prior: an effect that they imitate only far from it counts as an effect.
     total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] += 1.0 / np.square(problem.prior.sigma)

@@ -46,12 +46,11 @@ from optodrive.lab.diagnosis.instrument_disturbances import (
     remove_disturbances,
 )
 from optodrive.lab.diagnosis.model_comparison import (
-    ModelComparison,
     compute_height_error,
     compute_held_out_changes,
-    compute_held_out_errors,
     compute_held_out_gain,
     split_runs,
+    trace_groups,
 )
 from optodrive.lab.diagnosis.model_selection import (
     MAX_INTRA_PULSE_POWER_EXCESS,
@@ -83,7 +82,7 @@ NEARLY_EXPLAINED = 0.999
 class _SubsystemFit:
     """Results for the pixels or for the mirrors.
 
-    estimates: of the final parameters, discrepancy marginalised
+    estimates: of the final parameters, discrepancy marginalised; changes: of held-out errors by the chosen model
     """
 
     data: Dataset
@@ -93,17 +92,12 @@ class _SubsystemFit:
     selection: Selection
     final: ModelFit
     estimates: dict[str, Estimate]
+    changes: tuple[HeldOutChange, ...]
     gain: HeldOutGain | None
     candidates: tuple[CandidateCause, ...]
     rivals: tuple[RivalModel, ...]
     next_experiment: NextExperiment | None
-    log: SearchLog
     disturbances: tuple[InstrumentDisturbance, ...]
-
-    @property
-    def comparison(self) -> ModelComparison:
-        """Both models on all runs: the nominal one without the held-out runs, the extended one as fitted to all."""
-        return ModelComparison(self.data, self.problem, self.base.point, self.final.point)
 
     @property
     def blind_points(self) -> tuple[ParameterPoint, ParameterPoint]:
@@ -134,7 +128,7 @@ def diagnose(
     check_numeric_limits(measurement)
     check_recording_units(measurement, ParameterPoint(prior.mean, {}).pixel())
     check_copied_runs(measurement)
-    subsystems: list[_SubsystemFit] = []
+    log, subsystems = SearchLog(on_progress), list[_SubsystemFit]()
     for part in build_dataset(measurement).split_subsystems():
         # Pixels come first: their edges measure the timing jitter, which a mirror's repeats at rest do not show.
         timing_s = max((item.problem.noise.timing_sigma_s for item in subsystems), default=0.0)
@@ -145,79 +139,56 @@ def diagnose(
         if subsystems:
             # All signals share one clock, determined by the pixels; a late mirror then is a lag of the mirror.
             candidates = [item for item in candidates if len(discover_terms()[item.key].subsystems) == 1]
-        subsystems.append(
-            _diagnose_subsystem(
-                *(part, candidates, seed, prior, timing_s, _find_shared_terms(subsystems)),
-                SearchLog(on_progress),
-                hold_out,
-            )
-        )
-    log = SearchLog(on_progress)
-    for subsystem in subsystems:
-        log.failures.update(subsystem.log.failures)
-        log.omissions.update(subsystem.log.omissions)
-    disturbances = tuple(item for subsystem in subsystems for item in subsystem.disturbances)
-    claimed = combine_claims([subsystem.selection.claim for subsystem in subsystems], log.failures, bool(disturbances))
+        shared = _find_shared_terms(subsystems)
+        subsystems.append(_diagnose_subsystem(part, candidates, seed, prior, timing_s, shared, log, hold_out))
+    disturbances = tuple(each for item in subsystems for each in item.disturbances)
+    claimed = combine_claims([item.selection.claim for item in subsystems], log.failures, bool(disturbances))
     # The pixels where there are any; the mirrors alone else.
     main = subsystems[0]
-    parameters: dict[str, Estimate] = {}
-    terms: dict[str, dict[str, float]] = {}
+    named = [(item, chosen) for item in subsystems if (chosen := item.selection.chosen) is not None]
     doubts: dict[str, str] = {}
-    for subsystem in subsystems:
-        estimates = subsystem.estimates
-        parameters |= estimates
-        chosen = subsystem.selection.chosen
-        if chosen is not None:
-            doubts |= describe_doubts(chosen.hypotheses, estimates) | describe_limits(chosen.hypotheses, estimates)
-        terms |= {key: dict(values) for key, values in subsystem.final.point.terms.items()}
-    has_pixels = any(kind < 3 for kind in main.data.kinds)
-    base = (
-        dict(zip(BASE_PARAMETERS, np.exp(np.array(main.final.point.base)).tolist(), strict=True)) if has_pixels else {}
-    )
-    held_out = tuple(sorted({run.name for subsystem in subsystems for run in subsystem.held_out.runs}))
-    fitted = tuple(sorted({run.name for subsystem in subsystems for run in subsystem.data.runs}.difference(held_out)))
-    explained_fractions = [
-        subsystem.selection.explained_fraction for subsystem in subsystems if subsystem.selection.chosen is not None
-    ]
-    comparisons = [
-        item for item in (log.attempt("traces", _compare, None, subsystem) for subsystem in subsystems) if item
-    ]
+    for item, chosen in named:
+        doubts |= describe_doubts(chosen.hypotheses, item.estimates) | describe_limits(
+            chosen.hypotheses, item.estimates
+        )
+    terms = {key: dict(values) for item in subsystems for key, values in item.final.point.terms.items()}
+    base = np.exp(np.array(main.final.point.base)).tolist() if any(kind < 3 for kind in main.data.kinds) else []
+    held_out = tuple(sorted({run.name for item in subsystems for run in item.held_out.runs}))
+    fitted = tuple(sorted({run.name for item in subsystems for run in item.data.runs}.difference(held_out)))
     blind, no_traces = main.blind_points, tuple[ResidualTrace, ...]()
     return Discrepancy(
         verdict=claimed.verdict,
         causes=claimed.causes,
         disturbances=disturbances,
-        probabilities=reduce(Probabilities.combine, (subsystem.selection.probabilities for subsystem in subsystems)),
-        hypothesis_labels=tuple(
-            item.label
-            for subsystem in subsystems
-            if subsystem.selection.chosen is not None
-            for item in subsystem.selection.chosen.hypotheses
-        ),
-        parameters=parameters,
-        base=base,
+        probabilities=reduce(Probabilities.combine, (item.selection.probabilities for item in subsystems)),
+        parameters={name: each for item in subsystems for name, each in item.estimates.items()},
+        base=dict(zip(BASE_PARAMETERS, base, strict=False)),
         terms=terms if claimed.causes else {},
-        gain=next((subsystem.gain for subsystem in subsystems if subsystem.selection.chosen is not None), None),
-        candidates=tuple(item for subsystem in subsystems for item in subsystem.candidates),
-        next_experiment=next(
-            (subsystem.next_experiment for subsystem in subsystems if subsystem.next_experiment is not None), None
-        ),
+        gain=next((item.gain for item, _ in named), None),
+        candidates=tuple(each for item in subsystems for each in item.candidates),
+        next_experiment=next((item.next_experiment for item in subsystems if item.next_experiment is not None), None),
         fitted_runs=fitted,
         held_out_runs=held_out,
-        residual_traces=tuple(trace for comparison in comparisons for trace in comparison.trace_groups()),
-        example_traces=tuple(example for comparison in comparisons for example in comparison.trace_examples()),
+        # Both models on all runs: the nominal one without the held-out runs, the extended one as fitted to all.
+        residual_traces=tuple(
+            trace
+            for item in subsystems
+            for trace in log.attempt(
+                "traces", trace_groups, no_traces, item.problem, item.data, item.base.point, item.final.point
+            )
+        ),
         held_out_traces=tuple(
-            trace for subsystem in subsystems for trace in log.attempt("traces", _trace_held_out, no_traces, subsystem)
+            trace
+            for item in subsystems
+            for trace in log.attempt("traces", trace_groups, no_traces, item.problem, item.held_out, *item.blind_points)
         ),
         held_out_errors=tuple(
-            error
-            for subsystem in subsystems
-            for error in log.attempt("held-out errors", _compute_held_out_errors, list[HeldOutError](), subsystem)
+            HeldOutError(each.group, each.signal, each.runs, *each.rms) for item in subsystems for each in item.changes
         ),
-        rivals=tuple(rival for subsystem in subsystems for rival in subsystem.rivals),
+        rivals=tuple(each for item in subsystems for each in item.rivals),
         remarks=(*inspection.remarks, *_build_remarks(subsystems)),
         # The worse of both subsystems, so that the answer promises no more than each of them holds.
-        explained_fraction=min(explained_fractions, default=0.0),
+        explained_fraction=min((item.selection.explained_fraction for item, _ in named), default=0.0),
         doubts=doubts,
         failures=log.failures,
         height_error_held_out=log.attempt(
@@ -232,10 +203,6 @@ def diagnose(
         data_findings=inspection.findings,
         inspection_failures=inspection.failures,
     )
-
-
-def _compare(subsystem: _SubsystemFit) -> ModelComparison:
-    return subsystem.comparison
 
 
 def _diagnose_subsystem(
@@ -274,7 +241,7 @@ def _diagnose_subsystem(
     )
     selection = compare_explanations(problem, base, hypotheses, log)
     # Twins stay twins with more runs, so what they leave open is no reason to give up the held-out ones.
-    first = claim(replace(selection.collect_evidence(), twins={}))
+    first = claim(replace(selection.evidence, twins={}))
     # The noise stays that of the fitted runs, so that the two comparisons differ by the data alone.
     all_data = FitProblem(data, problem.noise, prior)
     if first.verdict in ("none", "undecided", "ambiguous") and held_out_runs:
@@ -285,10 +252,7 @@ def _diagnose_subsystem(
         chosen = replace(selection, claim=first).chosen
         all_base = fit(all_data, base.point, base.free)
         wider = compare_explanations(all_data, all_base, hypotheses, log)
-        if (
-            claim(replace(wider.collect_evidence(), twins={})).verdict not in ("none", first.verdict)
-            or chosen is not None
-        ):
+        if claim(replace(wider.evidence, twins={})).verdict not in ("none", first.verdict) or chosen is not None:
             # Nothing is held out any more, so no gain can be claimed: the report says so instead of a number from
             # fitted runs.
             problem, base, held_out, selection = all_data, all_base, data.select([]), wider
@@ -301,11 +265,11 @@ def _diagnose_subsystem(
     }
     # Judged twice: the sizes' intervals, which may raise a doubt, cost a fit to all runs and are computed for the
     # chosen one only.
-    selection = replace(selection, claim=claim(selection.collect_evidence(changes)))
+    selection = selection.judge(changes, {})
     chosen = selection.chosen
     final, estimates = _fit_all(all_data, base, chosen, hypotheses, log)
     doubts = {} if chosen is None else {chosen: describe_doubts(chosen.hypotheses, estimates)}
-    selection = replace(selection, claim=claim(selection.collect_evidence(changes, doubts)))
+    selection = selection.judge(changes, doubts)
     if selection.chosen is not chosen:
         final, estimates = _fit_all(all_data, base, selection.chosen, hypotheses, log)
     gains: dict[str, HeldOutGain | None] = {
@@ -315,6 +279,11 @@ def _diagnose_subsystem(
         for item in selection.candidates
     }
     reductions = {label: gain.reduction for label, gain in gains.items() if gain is not None}
+    if selection.chosen is None:
+        unextended = (problem, held_out, base.point, base.point)
+        own_changes = log.attempt("held-out runs", compute_held_out_changes, unchanged, *unextended)
+    else:
+        own_changes = changes[selection.chosen]
     return _SubsystemFit(
         data,
         held_out,
@@ -323,11 +292,11 @@ def _diagnose_subsystem(
         selection,
         final,
         estimates,
+        own_changes,
         None if selection.chosen is None else gains[selection.chosen.label],
         judge_candidates(selection, reductions),
         list_rivals(selection, reductions),
         log.attempt("the next experiment", propose_for_verdict, None, problem, base, selection, log.on_progress),
-        log,
         disturbances,
     )
 
@@ -396,18 +365,6 @@ def _revise_noise(
 def _list_varying_causes() -> set[str]:
     """Return the causes whose effect changes from run to run."""
     return {key for key, term in discover_terms().items() if term.varies_between_runs}
-
-
-def _trace_held_out(subsystem: _SubsystemFit) -> tuple[ResidualTrace, ...]:
-    if not subsystem.held_out.runs:
-        return ()
-    return ModelComparison(subsystem.held_out, subsystem.problem, *subsystem.blind_points).trace_groups()
-
-
-def _compute_held_out_errors(subsystem: _SubsystemFit) -> list[HeldOutError]:
-    if not subsystem.held_out.runs:
-        return []
-    return compute_held_out_errors(subsystem.problem, subsystem.held_out, *subsystem.blind_points)
 
 
 def _find_shared_terms(subsystems: list[_SubsystemFit]) -> dict[str, TermValues]:

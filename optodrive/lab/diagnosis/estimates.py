@@ -252,9 +252,7 @@ def compute_covariance(
     sensitivity = compute_jitter_sensitivity(data, fitted.point, fitted.prediction)
     jacobian = compute_jacobian(problem, fitted.point, fitted.free, fitted.prediction)
     residual = (data.value - fitted.prediction)[:, None]
-    total = compute_normal_equations(
-        data, np.hstack([jacobian, basis_columns, residual]), problem.noise, sensitivity.power, sensitivity.timing
-    ).total
+    total = compute_normal_equations(data, np.hstack([jacobian, basis_columns, residual]), problem.noise, sensitivity)
     return _marginalise(total[:-1, :-1], total[:-1, -1], problem.prior.sigma, jacobian.shape[1])
 
 

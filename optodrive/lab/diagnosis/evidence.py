@@ -87,11 +87,11 @@ class Explanation:
     hidden: float = 0.0
 
 
-def compute_log_evidence(problem: FitProblem, fitted: ModelFit, chi2: float) -> float:
-    """Return the logarithm of the marginal likelihood of a fit with this χ², up to a constant of the data."""
+def compute_log_evidence(problem: FitProblem, fitted: ModelFit) -> float:
+    """Return the logarithm of the marginal likelihood of a fit, up to a constant of the data."""
     count = len(problem.prior.sigma) + len(fitted.free)
     # Without the last column, the residual's.
-    hessian = fitted.gram.sum(axis=0)[:count, :count]
+    hessian = fitted.gram[:count, :count]
     precision = [1.0 / sigma**2 for sigma in problem.prior.sigma]
     scale = np.ones(count)
     for row, free in enumerate(fitted.free, start=len(precision)):
@@ -107,7 +107,7 @@ def compute_log_evidence(problem: FitProblem, fitted: ModelFit, chi2: float) -> 
     root = np.sqrt(precision)
     # Relative to the prior: a number that the data leave open costs nothing.
     relative = np.eye(count) + hessian * np.outer(scale / root, scale / root)
-    return -0.5 * (chi2 + float(np.linalg.slogdet(relative)[1]))
+    return -0.5 * (fitted.chi2 + float(np.linalg.slogdet(relative)[1]))
 
 
 def is_size(free: FreeParameter) -> bool:
@@ -280,11 +280,8 @@ class NoiseCertainty:
         problem = self._problem
         residual = (problem.data.value - fitted.prediction)[:, None]
         jitter = compute_jitter_sensitivity(problem.data, fitted.point, fitted.prediction)
-        equations = (
-            compute_normal_equations(problem.data, residual, noise, jitter.power, jitter.timing)
-            for noise in self._noises
-        )
-        return np.array([item.total[0, 0] for item in equations])
+        equations = (compute_normal_equations(problem.data, residual, noise, jitter) for noise in self._noises)
+        return np.array([item[0, 0] for item in equations])
 
 
 def _list_changes(problem: FitProblem) -> list[tuple[NoiseModel, float]]:

@@ -14,6 +14,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Block, Dataset
 from optodrive.lab.diagnosis.noise_model import NoiseModel, whiten
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
+from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
 from optodrive.physics.hypothesis import FreeParameter
 
 BASE_LOG_STEP = 1e-3
@@ -33,32 +34,16 @@ CHI2_CONVERGED = 0.02
 """Predicted or achieved decrease of χ² below which the iteration ends."""
 
 
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """Gram matrices [runs, k, k] of k whitened columns with jitters marginalised."""
-
-    gram: FloatArray
-
-    @property
-    def total(self) -> FloatArray:
-        """Sum over runs, [k, k]."""
-        return np.asarray(self.gram.sum(axis=0))
-
-
 def compute_normal_equations(
-    data: Dataset, columns: FloatArray, noise: NoiseModel, power: FloatArray, timing: FloatArray
-) -> NormalEquations:
-    """Compute the gram matrices of columns [m, k].
-
-    power, timing: sensitivities [m] as in `JitterSensitivity`
-    """
+    data: Dataset, columns: FloatArray, noise: NoiseModel, sensitivity: JitterSensitivity
+) -> FloatArray:
+    """Return the gram matrix [k, k] of k whitened columns [m, k], with the jitters of each run marginalised."""
     count, kinds = columns.shape[1], data.kinds
-    places = np.arange(count)
-    grams = [
-        reduce_run([(block, columns[block.part], places) for block in blocks], count, kinds, noise, power, timing)
-        for blocks in data.run_blocks
-    ]
-    return NormalEquations(np.array(grams))
+    places, total = np.arange(count), np.zeros((count, count))
+    for blocks in data.run_blocks:
+        parts = [(block, columns[block.part], places) for block in blocks]
+        total += reduce_run(parts, count, kinds, noise, sensitivity)
+    return total
 
 
 def reduce_run(
@@ -66,19 +51,18 @@ def reduce_run(
     count: int,
     kinds: list[int],
     noise: NoiseModel,
-    power: FloatArray,
-    timing: FloatArray,
+    sensitivity: JitterSensitivity,
 ) -> FloatArray:
     """Return the gram matrix [count, count] of the whitened columns of one run, its jitters marginalised.
 
-    parts: blocks of the run with their columns and the numbers of these; power, timing: as in `JitterSensitivity`
+    parts: blocks of the run with their columns and the numbers of these
     """
     size = 2 + len(kinds)
     gram = np.zeros((count + size, count + size))
     for block, columns, places in parts:
         jitters = [
-            noise.power_sigma * power[block.part],
-            noise.timing_sigma_s * timing[block.part],
+            noise.power_sigma * sensitivity.power[block.part],
+            noise.timing_sigma_s * sensitivity.timing[block.part],
             np.full(len(block.t_s), noise.baseline_sigma[block.kind]),
         ]
         whitened, _ = whiten(block.t_s, np.column_stack([columns, *jitters]), noise.coloured[block.kind])
@@ -142,18 +126,10 @@ class BaseParameterPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class JitterSensitivity:
-    """Derivatives of the prediction [m] with respect to the logarithm of the power and to a delay, per second."""
-
-    power: FloatArray
-    timing: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class ModelFit:
     """Result of a fit.
 
-    chi2: with priors; covariance: of base, then free parameters; gram: [runs, k + 1, k + 1], the residual last
+    chi2: with priors; covariance: of base, then free parameters; gram: [k + 1, k + 1], the residual last
     """
 
     point: ParameterPoint
@@ -264,9 +240,7 @@ def fit(
         remaining -= 1
         deviation = np.concatenate([trial.base, np.zeros(len(free))]) - centre
         residual = (data.value - prediction)[:, None]
-        cost = float(
-            compute_normal_equations(data, residual, problem.noise, sensitivity.power, sensitivity.timing).total[0, 0]
-        )
+        cost = float(compute_normal_equations(data, residual, problem.noise, sensitivity)[0, 0])
         cost += float(precision @ deviation**2)
         if best is None and not np.isfinite(cost):
             raise DivergedError("the fit", Unquoted("a χ² that is no number"), "a finite one at its start")
@@ -280,11 +254,10 @@ def fit(
             improvement = np.inf if best is None else best.chi2 - cost
             damping = damping / DAMPING_DECREASE if damping > MIN_DAMPING else 0.0
             columns = np.column_stack([compute_jacobian(problem, trial, free, prediction), residual])
-            gram = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).gram
-            total = gram.sum(axis=0)
-            hessian = total[:count, :count] + np.diag(precision)
+            gram = compute_normal_equations(data, columns, problem.noise, sensitivity)
+            hessian = gram[:count, :count] + np.diag(precision)
             covariance = solve(hessian, np.eye(count))
-            gradient = total[:count, -1] - precision * deviation
+            gradient = gram[:count, -1] - precision * deviation
             best = ModelFit(trial, tuple(free), cost, covariance, gram, prediction)
             limits = compute_step_limits(problem, trial, free)
             step = solve_within(hessian, gradient, *limits)

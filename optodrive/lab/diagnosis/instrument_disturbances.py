@@ -26,9 +26,9 @@ from scipy.special import chdtrc, fdtrc
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import InstrumentDisturbance
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, SIGNALS, Block, Dataset
-from optodrive.lab.diagnosis.fitting import JitterSensitivity
 from optodrive.lab.diagnosis.instrument_hops import find_hops
 from optodrive.lab.diagnosis.noise_model import NoiseModel, find_resolution, whiten
+from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
 from optodrive.physics.term import BySignal
 
 DRIFT_DEGREES, MAX_DRIFT_P, MIN_DRIFT_RUNS, MIN_QUIET_SAMPLES = (1, 3), 1e-6, 6, 4
@@ -82,15 +82,12 @@ def find_dc_coupled(data: Dataset, residual: FloatArray, noise: NoiseModel) -> f
     found = set()
     for kind in (kind for kind in data.kinds if kind in PIXEL_KINDS):
         rows = []
-        for block in data.blocks:
-            pulses = data.runs[block.run].pulses
-            count = int(np.searchsorted(block.t_s, pulses[:, 0].min())) if block.kind == kind and len(pulses) else 0
-            if count >= MIN_QUIET_SAMPLES:
-                columns = np.column_stack([np.ones(count), residual[block.part][:count]])
-                whitened, _ = whiten(block.t_s[:count], columns, noise.coloured[kind])
-                weight = float(whitened[:, 0] @ whitened[:, 0])
-                variance = 1.0 / weight + noise.coloured[kind].white ** 2
-                rows.append((float(whitened[:, 0] @ whitened[:, 1]) / weight, 1.0 / variance))
+        for number, value in _list_quiet(data, residual, kind):
+            columns = np.column_stack([np.ones(len(value)), value])
+            whitened, _ = whiten(data.blocks[number].t_s[: len(value)], columns, noise.coloured[kind])
+            weight = float(whitened[:, 0] @ whitened[:, 0])
+            variance = 1.0 / weight + noise.coloured[kind].white ** 2
+            rows.append((float(whitened[:, 0] @ whitened[:, 1]) / weight, 1.0 / variance))
         if len(rows) >= MIN_DRIFT_RUNS:
             zeros, weights = np.array(rows).T
             spread = float(weights @ (zeros - np.average(zeros, weights=weights)) ** 2)
@@ -99,17 +96,21 @@ def find_dc_coupled(data: Dataset, residual: FloatArray, noise: NoiseModel) -> f
     return frozenset(found)
 
 
+def _list_quiet(data: Dataset, residual: FloatArray, kind: int) -> list[tuple[int, FloatArray]]:
+    """Return the number of each block of a kind, with its residuals before the first pulse where there are enough."""
+    quiet = []
+    for number, block in enumerate(data.blocks):
+        first_s = data.runs[block.run].pulses[:, 0].min(initial=np.inf)
+        value = residual[block.part][block.t_s < first_s]
+        if block.kind == kind and len(value) >= MIN_QUIET_SAMPLES:
+            quiet.append((number, value))
+    return quiet
+
+
 def _find_drift(data: Dataset, residual: FloatArray, kind: int) -> tuple[InstrumentDisturbance, FloatArray] | None:
     """Return the drift of the zero of one kind of signal over the recording and its values [m], or None."""
     session = [recorded.session_time for recorded in data.recorded_runs]
-    rows = []
-    for number, block in enumerate(data.blocks):
-        if block.kind != kind:
-            continue
-        pulses = data.runs[block.run].pulses
-        is_quiet = block.t_s < (pulses[:, 0].min() if len(pulses) else np.inf)
-        if is_quiet.sum() >= MIN_QUIET_SAMPLES:
-            rows.append((session[number], float(residual[block.part][is_quiet].mean())))
+    rows = [(session[number], float(value.mean())) for number, value in _list_quiet(data, residual, kind)]
     if len(rows) < MIN_DRIFT_RUNS:
         return None
     times, zeros = np.array(rows).T

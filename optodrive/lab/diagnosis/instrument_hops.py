@@ -14,9 +14,8 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import InstrumentDisturbance
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, SIGNALS, Block, BoolArray, Dataset
-from optodrive.lab.diagnosis.fitting import JitterSensitivity
 from optodrive.lab.diagnosis.noise_model import NoiseModel, find_resolution, whiten
-from optodrive.lab.diagnosis.replicate_contrasts import Contrast, compute_contrasts
+from optodrive.lab.diagnosis.replicate_contrasts import Contrast, JitterSensitivity, compute_contrasts
 
 HOP_WINDOWS, MIN_HOP_SAMPLES = (6, 24), 60
 SINGLE_HOP, PAIR_HOP, MORE_HOPS = 6.5, 5.5, 5.0
@@ -78,7 +77,7 @@ def _find_largest_hop(
     """
     contrasts = [
         item
-        for item in compute_contrasts(data, residual, sensitivity.power, sensitivity.timing)
+        for item in compute_contrasts(data, residual, sensitivity)
         if item.kind in PIXEL_KINDS and len(item.t_s) >= MIN_HOP_SAMPLES
     ]
     best: tuple[float, Contrast, float] | None = None

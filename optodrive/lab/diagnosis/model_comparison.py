@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.types.discrepancy import ExampleTrace, HeightError, HeldOutError, HeldOutGain, ResidualTrace
+from optodrive.core.types.discrepancy import HeightError, HeldOutGain, ResidualTrace
 from optodrive.lab.diagnosis.dataset import SIGNALS, Block, Dataset
 from optodrive.lab.diagnosis.fitting import FitProblem, compute_jitter_sensitivity, compute_normal_equations
 from optodrive.lab.diagnosis.omnibus_test import compute_omnibus_by_group
@@ -25,56 +25,27 @@ MAX_NOISE = 0.1
 """Pushes whose measured height is uncertain by more than this share of the predicted one are not judged."""
 
 
-class ModelComparison:
-    """Residuals of the nominal and the extended model on a dataset, in units of the white noise of each signal."""
-
-    def __init__(self, data: Dataset, problem: FitProblem, nominal: ParameterPoint, extended: ParameterPoint) -> None:
-        self._data = data
-        self._sigma = {kind: problem.noise.coloured[kind].white for kind in data.kinds}
-        self._nominal = data.value - predict(data, nominal)
-        self._extended = data.value - predict(data, extended)
-
-    def trace_groups(self) -> tuple[ResidualTrace, ...]:
-        """Return the signals of the first run of each group."""
-        first: dict[tuple[str, int], Block] = {}
-        for block in self._data.blocks:
-            first.setdefault((self._data.runs[block.run].group, block.kind), block)
-        return tuple(self._trace(block) for block in first.values())
-
-    def trace_examples(self) -> tuple[ExampleTrace, ...]:
-        """Return the worst and the typical run of each signal. Return only the worst of a single run."""
-        examples = []
-        for kind in self._data.kinds:
-            blocks = sorted(
-                (block for block in self._data.blocks if block.kind == kind), key=self._compute_rms, reverse=True
-            )
-            examples.append(ExampleTrace("worst", self._trace(blocks[0])))
-            if len(blocks) > 1:
-                examples.append(ExampleTrace("typical", self._trace(blocks[len(blocks) // 2])))
-        return tuple(examples)
-
-    def _compute_rms(self, block: Block) -> float:
-        """Return the rms residual of the nominal model, in units of sigma."""
-        return float(np.sqrt(np.mean(self._nominal[block.part] ** 2))) / self._sigma[block.kind]
-
-    def _trace(self, block: Block) -> ResidualTrace:
-        stride = max(1, len(block.t_s) // TRACE_POINTS)
-        edges = np.arange(0, len(block.t_s), stride)
+def trace_groups(
+    problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint
+) -> tuple[ResidualTrace, ...]:
+    """Return the signals of the first run of each group, with the residuals of both models."""
+    if not len(data.value):
+        return ()
+    columns = [data.value, *(data.value - predict(data, point) for point in (nominal, extended))]
+    first: dict[tuple[str, int], ResidualTrace] = {}
+    for block in data.blocks:
+        run, sigma = data.runs[block.run], problem.noise.coloured[block.kind].white
+        if (run.group, block.kind) in first:
+            continue
+        edges = np.arange(0, len(block.t_s), max(1, len(block.t_s) // TRACE_POINTS))
         count = np.diff(np.append(edges, len(block.t_s)))
-        values = (block.t_s, *(x[block.part] for x in (self._data.value, self._nominal, self._extended)))
-        t_s, measured, nominal, extended = (np.add.reduceat(item, edges) / count for item in values)
-        run, sigma = self._data.runs[block.run], self._sigma[block.kind]
-        return ResidualTrace(
-            run.name,
-            run.group,
-            SIGNALS[block.kind],
-            sigma,
-            t_s,
-            measured,
-            nominal / sigma,
-            extended / sigma,
-            self._compute_rms(block),
+        means = (np.add.reduceat(item, edges) / count for item in (block.t_s, *(x[block.part] for x in columns)))
+        t_s, measured, before, after = means
+        rms = float(np.sqrt(np.mean(columns[1][block.part] ** 2))) / sigma
+        first[run.group, block.kind] = ResidualTrace(
+            run.name, run.group, SIGNALS[block.kind], sigma, t_s, measured, before / sigma, after / sigma, rms
         )
+    return tuple(first.values())
 
 
 @dataclass(frozen=True)
@@ -229,23 +200,6 @@ def compute_held_out_gain(
     )
 
 
-def compute_held_out_errors(
-    problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint
-) -> list[HeldOutError]:
-    """Return the RMSE of both models in every signal of every held-out group."""
-    problem = replace(problem, data=data)
-    squares = [(data.value - predict(data, point)) ** 2 for point in (nominal, extended)]
-    squares.append(_compute_noise_floor2(problem, extended))
-    errors = []
-    for group, runs in data.groups.items():
-        for kind in data.kinds:
-            parts = [block.part for block in data.blocks if block.run in runs and block.kind == kind]
-            if parts:
-                rmse = [float(np.sqrt(np.concatenate([item[part] for part in parts]).mean())) for item in squares]
-                errors.append(HeldOutError(group, SIGNALS[kind], len(parts), rmse[0], rmse[1], rmse[2]))
-    return errors
-
-
 def compute_held_out_changes(
     problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint
 ) -> tuple[HeldOutChange, ...]:
@@ -261,13 +215,15 @@ def compute_held_out_changes(
             before, after = (predict(part, point) for point in (nominal, extended))
             jitter = compute_jitter_sensitivity(part, extended, after)
             columns = np.column_stack([part.value - before, after - before])
-            gram = compute_normal_equations(part, columns, problem.noise, jitter.power, jitter.timing).total
+            gram = compute_normal_equations(part, columns, problem.noise, jitter)
             norm2 = float(gram[1, 1])
             floor2 = _compute_noise_floor2(replace(problem, data=part), extended)
             squares = ((part.value - before) ** 2, (part.value - after) ** 2, floor2)
             rms = [float(np.sqrt(np.mean(each))) for each in squares]
             chi2, spread = norm2 - 2.0 * float(gram[0, 1]), 2.0 * norm2**0.5
-            changes.append(HeldOutChange(group, SIGNALS[kind], chi2, spread, (rms[0], rms[1], rms[2])))
+            changes.append(
+                HeldOutChange(group, SIGNALS[kind], chi2, spread, (rms[0], rms[1], rms[2]), len(part.blocks))
+            )
     return tuple(changes)
 
 

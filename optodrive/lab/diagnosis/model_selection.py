@@ -12,7 +12,7 @@ other forms of their own effect and a free mean per bin, and second causes are r
 that a search began with the wrong single, whose parts are then refitted alone. `evidence.py` turns all of them into
 probabilities.
 
-Verdict. None here: what may be claimed of these numbers is decided in `lab/inference/claim.py`.
+Verdict. What may be claimed of these numbers is decided in `lab/inference/claim.py`.
 
 Invariants. Nothing here changes the data or the noise model. The same recording gives the same verdict. A hypothesis
 that cannot be computed is recorded in the log with its reason.
@@ -20,7 +20,7 @@ that cannot be computed is recorded in the log with its reason.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import log, log1p, prod
 
 import numpy as np
@@ -49,7 +49,7 @@ from optodrive.lab.diagnosis.evidence import (
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
 from optodrive.lab.diagnosis.prediction import predict
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_alone, refit_pairs, refit_strongest
-from optodrive.lab.inference.claim import MIN_EXPLAINED, UNJUDGED, Alternative, Claim, Evidence, HeldOutChange
+from optodrive.lab.inference.claim import MIN_EXPLAINED, UNJUDGED, Alternative, Claim, Evidence, HeldOutChange, claim
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -75,37 +75,33 @@ MAX_INTRA_PULSE_POWER_EXCESS = 25.0
 class Selection:
     """The explanations of a subsystem, compared.
 
-    candidates: refits, most probable first; shares: of the excess that each explains alone and with other forms of its
-    effect, where examined; twins as in `Evidence`; claim: the judge's; nominal_detection: beside the nominal fit;
-    nominal_chi2: of that fit
+    candidates: refits, most probable first; evidence: with an alternative for each of these; nominal_detection: beside
+    the nominal fit; nominal_chi2: of that fit; claim: the judge's
     """
 
-    probabilities: Probabilities
     candidates: tuple[RefittedCandidate, ...]
-    shares: Mapping[RefittedCandidate, tuple[float, float]]
+    evidence: Evidence
     nominal_detection: Detection
     nominal_chi2: float
-    has_repeats: bool
-    twins: Mapping[str, str] = field(default_factory=dict)
-    repeats_differ: bool = False
     claim: Claim = UNJUDGED
 
-    def collect_evidence(
+    def judge(
         self,
-        held_out: Mapping[RefittedCandidate, tuple[HeldOutChange, ...]] | None = None,
-        doubts: Mapping[RefittedCandidate, Mapping[str, str]] | None = None,
-    ) -> Evidence:
-        """Return the evidence for the judge, with held-out runs and doubts about sizes where these are known."""
+        held_out: Mapping[RefittedCandidate, tuple[HeldOutChange, ...]],
+        doubts: Mapping[RefittedCandidate, Mapping[str, str]],
+    ) -> "Selection":
+        """Return the selection with its claim, where held-out runs and doubts about sizes are known."""
         alternatives = tuple(
-            Alternative(
-                item.causes,
-                self.shares.get(item),
-                (held_out or {}).get(item, ()),
-                (doubts or {}).get(item, {}),
-            )
-            for item in self.candidates
+            replace(alternative, held_out=held_out.get(item, ()), doubts=doubts.get(item, {}))
+            for item, alternative in zip(self.candidates, self.evidence.alternatives, strict=True)
         )
-        return Evidence(self.probabilities, alternatives, self.twins, self.has_repeats, self.repeats_differ)
+        evidence = replace(self.evidence, alternatives=alternatives)
+        return replace(self, evidence=evidence, claim=claim(evidence))
+
+    @property
+    def probabilities(self) -> Probabilities:
+        """Probabilities of all explanations."""
+        return self.evidence.probabilities
 
     @property
     def chosen(self) -> RefittedCandidate | None:
@@ -123,7 +119,10 @@ class Selection:
     def explained_fraction(self) -> float:
         """Share of the detected excess that the chosen model explains."""
         chosen = self.chosen
-        return 0.0 if chosen is None else self.shares.get(chosen, (0.0, 0.0))[0]
+        if chosen is None:
+            return 0.0
+        explained = self.evidence.alternatives[self.candidates.index(chosen)].explained
+        return 0.0 if explained is None else explained[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +159,7 @@ def compare_explanations(
     # Repeats that differ so, as by missed pulses, leave no noise by which explanations could be compared.
     if has_replicate_excess(problem):
         probabilities = Probabilities(1.0 - CERTAIN, CERTAIN, {(item.key,): 0.0 for item in hypotheses})
-        return Selection(probabilities, (), {}, nominal_detection, base.chi2, True, repeats_differ=True)
+        return Selection((), Evidence(probabilities, (), repeats_differ=True), nominal_detection, base.chi2)
     singles = refit_strongest(problem, base, (), nominal_detection, log)
     return compare_from_single_causes(problem, base, hypotheses, nominal_detection, singles, log)
 
@@ -204,8 +203,10 @@ def compare_from_single_causes(
         best.setdefault(tuple(sorted(item.causes)), item)
     candidates = tuple(best[keys] for keys, _ in probabilities.ranked if keys in best)
     shares = {item: (rest.explained, rest.explained_with_forms) for item, rest in examined.items()}
-    has_repeats, twins = problem.noise.from_replicates, _pair_twins(nominal_detection)
-    return Selection(probabilities, candidates, shares, nominal_detection, base.chi2, has_repeats, twins)
+    alternatives = tuple(Alternative(item.causes, shares.get(item)) for item in candidates)
+    twins = _pair_twins(nominal_detection)
+    evidence = Evidence(probabilities, alternatives, twins, problem.noise.from_replicates)
+    return Selection(candidates, evidence, nominal_detection, base.chi2)
 
 
 def _pair_twins(detection: Detection) -> dict[str, str]:
@@ -283,7 +284,7 @@ def _list_explanations(
     """Return every explanation of the recording with its prior and its evidence."""
     degrees_of = _count_degrees(problem, base, refits)
     degrees = degrees_of.pop(None)
-    nothing = compute_log_evidence(problem, base, base.chi2)
+    nothing = compute_log_evidence(problem, base)
     something = nothing + nominal_detection.omnibus.evidence.log_evidence
     out = [
         Explanation((), log(PRIOR_NO_EFFECT), nothing, degrees),

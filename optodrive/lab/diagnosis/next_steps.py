@@ -175,7 +175,7 @@ def _compute_separation(problem: FitProblem, first: ModelFit, second: ModelFit, 
     first_jacobian = compute_jacobian(synthetic, first.point, first.free, first_prediction)
     second_jacobian = compute_jacobian(synthetic, second.point, second.free, second_prediction)
     columns = np.column_stack([first_jacobian, second_jacobian, first_prediction - second_prediction])
-    gram = repeats * compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total
+    gram = repeats * compute_normal_equations(data, columns, problem.noise, sensitivity)
     count = columns.shape[1] - 1
     precision = np.zeros((count, count))
     width = first_jacobian.shape[1]

@@ -43,6 +43,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset
 from optodrive.lab.diagnosis.replicate_contrasts import (
     Contrast,
+    JitterSensitivity,
     Windows,
     average_windows,
     build_residual_contrasts,
@@ -181,12 +182,9 @@ def whiten(t_s: FloatArray, columns: FloatArray, noise: ColouredNoise) -> tuple[
     return out, logdet
 
 
-def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> NoiseModel:
-    """Estimate the noise model by maximum likelihood from the contrasts, or from the residuals if no run is repeated.
-
-    power, timing: sensitivities [m] as in `JitterSensitivity`
-    """
-    contrasts = compute_contrasts(data, residual, power, timing)
+def estimate_noise_model(data: Dataset, residual: FloatArray, sensitivity: JitterSensitivity) -> NoiseModel:
+    """Estimate the noise by maximum likelihood from the contrasts, or from the residuals if no run is repeated."""
+    contrasts = compute_contrasts(data, residual, sensitivity)
     coloured: dict[int, ColouredNoise] = {}
     quanta: dict[int, float] = {}
     repeats_differ = any(item.value.any() for item in contrasts)
@@ -196,7 +194,7 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
         if not members:
             # Residuals contain the effect that is sought, so this noise is too large; the report says that it is a
             # guess.
-            members = build_residual_contrasts(data, residual, power, timing, kind)
+            members = build_residual_contrasts(data, residual, sensitivity, kind)
         values, span = _collect_values(data, data.value - residual, kind)
         quanta[kind] = _find_quantum(values)
         coloured[kind] = _fit_coloured(members, estimate_resolution(values, span), windows)

@@ -89,7 +89,7 @@ def update_noise(problem: FitProblem, fitted: ModelFit, min_timing_sigma_s: floa
     """Return the problem with the noise model estimated from repeats, with jitter sensitivities at this fit."""
     data = problem.data
     sensitivity = compute_jitter_sensitivity(data, fitted.point, fitted.prediction)
-    noise = estimate_noise_model(data, data.value - fitted.prediction, sensitivity.power, sensitivity.timing)
+    noise = estimate_noise_model(data, data.value - fitted.prediction, sensitivity)
     noise = replace(
         noise,
         timing_sigma_s=max(noise.timing_sigma_s, min_timing_sigma_s),
@@ -137,7 +137,7 @@ def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> flo
     pixel = base.point.pixel()
     experiments = {number: experiment for experiment, numbers in data.experiments for number in numbers}
     pairs: dict[int, list[Contrast]] = {}
-    for item in compute_contrasts(data, data.value - base.prediction, sensitivity.power, sensitivity.timing):
+    for item in compute_contrasts(data, data.value - base.prediction, sensitivity):
         if item.kind in PIXEL_KINDS:
             pairs.setdefault(item.pair, []).append(item)
     excess = variance = 0.0

@@ -14,8 +14,9 @@ from scipy.linalg import cho_factor, cho_solve
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import Dataset
 from optodrive.lab.diagnosis.evidence import BinEvidence, compute_bin_evidence
-from optodrive.lab.diagnosis.fitting import FitProblem, JitterSensitivity, project_out, reduce_run
+from optodrive.lab.diagnosis.fitting import FitProblem, project_out, reduce_run
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS
+from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
 
 EDGE_BINS_S = np.geomspace(5e-4, 1.0, 9)
 """Bin edges of the time after a gate edge."""
@@ -86,7 +87,7 @@ def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: Jitte
             places = np.concatenate([np.arange(width), width + np.searchsorted(run_bins, block_bins)])
             parts.append((block, np.hstack([columns[block.part], indicators]), places))
         size = width + len(run_bins)
-        reduced = reduce_run(parts, size, data.kinds, problem.noise, sensitivity.power, sensitivity.timing)
+        reduced = reduce_run(parts, size, data.kinds, problem.noise, sensitivity)
         indices = np.concatenate([np.arange(width), width + run_bins])
         total[np.ix_(indices, indices)] += reduced
         bin_gram, bin_right = reduced[width:, width:], reduced[width:, width - 1]

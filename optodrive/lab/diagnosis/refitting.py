@@ -10,6 +10,7 @@ from optodrive.lab.diagnosis.detection import UNCOMPUTABLE, Detection, Score, Se
 from optodrive.lab.diagnosis.evidence import compute_log_evidence
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_normal_equations, fit
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 
 CHI2_ABANDON = 300.0
@@ -32,13 +33,17 @@ MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
 class RefittedCandidate:
     """One or two hypotheses, refitted.
 
-    chi2: of the fit, under the jitters at its end; log_evidence: of this χ²
+    fit: under the jitters at its end; log_evidence: of its χ²
     """
 
     hypotheses: tuple[Hypothesis, ...]
     fit: ModelFit
-    chi2: float
     log_evidence: float
+
+    @property
+    def chi2(self) -> float:
+        """χ² of the fit."""
+        return self.fit.chi2
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -87,8 +92,8 @@ def refit_strongest(
     for score, result in fits:
         # After all fits, when the limit is known: settling costs as much as the fit.
         settled = _settle(problem, result) if result.chi2 < chi2_abandon else result
-        evidence = compute_log_evidence(problem, settled, settled.chi2)
-        candidates.append(RefittedCandidate((*given, score.hypothesis), settled, settled.chi2, evidence))
+        hypotheses = (*given, score.hypothesis)
+        candidates.append(RefittedCandidate(hypotheses, settled, compute_log_evidence(problem, settled)))
     return sorted(candidates, key=lambda item: -item.log_evidence)
 
 
@@ -171,7 +176,7 @@ def refit_alone(
         except UNCOMPUTABLE as error:
             log.add_failure(item.label, error)
             continue
-        candidate = RefittedCandidate((item,), result, result.chi2, compute_log_evidence(problem, result, result.chi2))
+        candidate = RefittedCandidate((item,), result, compute_log_evidence(problem, result))
         best[item.label] = max(best.get(item.label, candidate), candidate, key=lambda each: each.log_evidence)
     return sorted(best.values(), key=lambda each: -each.log_evidence)
 
@@ -206,11 +211,12 @@ def _refit_every_start(
 def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis) -> list[ParameterPoint]:
     """Return the starts with the smallest χ² without a fit."""
     zero = np.zeros(len(problem.data.value))
+    none = JitterSensitivity(zero, zero)
 
     def cost(point: ParameterPoint) -> float:
         residual = problem.data.value - predict(problem.data, point)
         # Without jitters: their sensitivities cost three predictions for each of many starts, which only need an order.
-        return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total[0, 0])
+        return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, none)[0, 0])
 
     points = (ParameterPoint(base.point.base, {**base.point.terms, item.key: values}) for values in item.starts)
     return sorted(points, key=cost)[:MAX_STARTS]

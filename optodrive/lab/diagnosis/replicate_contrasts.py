@@ -23,6 +23,14 @@ MAX_WINDOW = 64
 
 
 @dataclass(frozen=True, eq=False)
+class JitterSensitivity:
+    """Derivatives of the prediction [m] with respect to the logarithm of the power and to a delay, per second."""
+
+    power: FloatArray
+    timing: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Contrast:
     """Contrast between repeats in one signal kind.
 
@@ -38,7 +46,7 @@ class Contrast:
     jitter: FloatArray
 
 
-def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> list[Contrast]:
+def compute_contrasts(data: Dataset, residual: FloatArray, sensitivity: JitterSensitivity) -> list[Contrast]:
     """Compute Helmert contrasts between the runs of each group on their common samples."""
     contrasts: list[Contrast] = []
     blocks: dict[tuple[int, int, int], int] = {
@@ -70,7 +78,8 @@ def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, ti
                 # With the mean residual, jitters act along the measured trace, also where the model misses it.
                 mean = np.mean([residual[r] for r in rows], axis=0)
                 missed = np.gradient(mean, t_s)
-                jitter = np.stack([power[last] + mean, timing[last] - missed, np.ones(len(last))], axis=1)
+                power, timing = sensitivity.power[last] + mean, sensitivity.timing[last] - missed
+                jitter = np.stack([power, timing, np.ones(len(last))], axis=1)
                 contrasts.append(Contrast(pair, kind, block, t_s, value, jitter))
                 used = True
             pair += used
@@ -190,13 +199,14 @@ def find_window(t_s: FloatArray, windows: Windows) -> NoiseWindow | None:
 
 
 def build_residual_contrasts(
-    data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray, kind: int
+    data: Dataset, residual: FloatArray, sensitivity: JitterSensitivity, kind: int
 ) -> list[Contrast]:
     """Return the residuals of one signal kind in place of contrasts, for recordings without repeats."""
     contrasts = []
     for number, block in enumerate(data.blocks):
         if block.kind == kind:
             part = block.part
-            jitter = np.stack([power[part], timing[part], np.ones(part.stop - part.start)], axis=1)
+            ones = np.ones(part.stop - part.start)
+            jitter = np.stack([sensitivity.power[part], sensitivity.timing[part], ones], axis=1)
             contrasts.append(Contrast(block.run, kind, number, block.t_s, residual[part], jitter))
     return contrasts

@@ -14,7 +14,7 @@ from optodrive.core.document import Document, Figure, Markup, Section, Table
 from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_number, format_quantity
 from optodrive.core.svg_plot import Axis, Series, draw_plot
-from optodrive.core.types.discrepancy import Discrepancy, ExampleTrace, Probabilities, ResidualTrace
+from optodrive.core.types.discrepancy import Discrepancy, Probabilities, ResidualTrace
 from optodrive.lab.diagnosis.candidate_judgement import DETECTABLE_RATIO
 from optodrive.lab.diagnosis.detection import SearchLog
 from optodrive.lab.diagnosis.narrative import build_narrative
@@ -67,10 +67,10 @@ def build_report(
             [
                 Markup(
                     f"<p>{MEASURED}, {models}. The nominal model has the R, C, τ<sub>g</sub>, κ and φ that fit these "
-                    "data best, not those of a parameter set. Of each signal the run in which it is worst, and the "
-                    "median one; below, measured minus model. The band is the noise of one sample, ± σ.</p>"
+                    "data best, not those of a parameter set. Of each signal the experiment in which it is worst, and "
+                    "the median one; below, measured minus model. The band is the noise of one sample, ± σ.</p>"
                 ),
-                [draw_example(example, has_extension) for example in discrepancy.example_traces],
+                _draw_examples(discrepancy.residual_traces, has_extension),
             ],
         ),
         Section("Error of planned heights", _build_height_errors(discrepancy, has_extension)),
@@ -232,11 +232,21 @@ def _build_parameter_table(discrepancy: Discrepancy) -> Table:
     return Table("Parameters", ("parameter", "value", "95 % from", "to"), rows, {1, 2, 3})
 
 
-def draw_example(example: ExampleTrace, has_extension: bool) -> Figure:
+def _draw_examples(traces: Sequence[ResidualTrace], has_extension: bool) -> list[Figure]:
+    """Draw the worst and the median trace of each signal. Of a single one draw the worst only."""
+    drawn = []
+    for signal in dict.fromkeys(trace.signal for trace in traces):
+        ranked = sorted((trace for trace in traces if trace.signal == signal), key=lambda trace: -trace.rms_nominal)
+        drawn.append(_draw_example("worst", ranked[0], has_extension))
+        if len(ranked) > 1:
+            drawn.append(_draw_example("typical", ranked[len(ranked) // 2], has_extension))
+    return drawn
+
+
+def _draw_example(role: str, trace: ResidualTrace, has_extension: bool) -> Figure:
     """Draw a run's measured values with the models, and below them the residuals."""
-    trace = example.trace
     unit = trace.signal.rsplit("_", 1)[1]
-    title = f"{example.role} run of {trace.signal}: {trace.run}"
+    title = f"{role} run of {trace.signal}: {trace.run}"
     series = [
         Series(trace.measured, "measured", is_dotted=True),
         Series(trace.compute_model(trace.nominal), "nominal"),
@@ -246,7 +256,7 @@ def draw_example(example: ExampleTrace, has_extension: bool) -> Figure:
     plot = draw_plot(f"{title}, measured and model", trace.t_s, TIME, axis, series, TRACE_HEIGHT)
     return Figure(
         plot + draw_residual_plot(trace, has_extension, title),
-        f"{example.role.capitalize()} run of {trace.signal}: {trace.run} ({trace.group}); the nominal model is "
+        f"{role.capitalize()} run of {trace.signal}: {trace.run} ({trace.group}); the nominal model is "
         f"{trace.rms_nominal:.1f} σ rms off, σ = {format_quantity(trace.sigma, unit)}",
     )
 

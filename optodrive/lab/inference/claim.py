@@ -71,8 +71,9 @@ NOTHING_FOUND = ("none", "instrument", "incomplete", "undecided")
 class HeldOutChange:
     """Change of χ² of one signal of a held-out group by an extension, and the standard deviation of it by noise.
 
-    rms: errors without and with the extension, and by noise and jitter alone. χ² counts what differs from run to run
-    little, so an extension that predicts the shape of a response, and its height wrongly, lowers it.
+    rms: errors without and with the extension, and by noise and jitter alone, in runs of this number. χ² counts what
+    differs from run to run little, so an extension that predicts the shape of a response, and its height wrongly,
+    lowers it.
     """
 
     group: str
@@ -80,6 +81,7 @@ class HeldOutChange:
     chi2: float
     noise: float
     rms: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    runs: int = 1
 
     @property
     def sigma(self) -> float:

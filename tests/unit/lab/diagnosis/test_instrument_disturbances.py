@@ -7,9 +7,9 @@ import pytest
 
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.diagnosis.dataset import build_dataset
-from optodrive.lab.diagnosis.fitting import JitterSensitivity
 from optodrive.lab.diagnosis.instrument_disturbances import find_dc_coupled, find_disturbances
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel
+from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
 
 NOISE_M, NOISE_K = 2e-6, 0.2
 T_S = np.arange(600) / 2500.0

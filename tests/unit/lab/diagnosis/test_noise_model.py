@@ -15,7 +15,13 @@ from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity, compute_
 from optodrive.lab.diagnosis.model_selection import MAX_INTRA_PULSE_POWER_EXCESS, MAX_REPLICATE_EXCESS
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, whiten
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
-from optodrive.lab.diagnosis.replicate_contrasts import Contrast, average_windows, compute_contrasts, find_windows
+from optodrive.lab.diagnosis.replicate_contrasts import (
+    Contrast,
+    JitterSensitivity,
+    average_windows,
+    compute_contrasts,
+    find_windows,
+)
 
 NOISE = ColouredNoise(white=0.3, sigma=(0.2, 0.4), tau_s=(0.01, 0.05), omega_rad_per_s=300.0)
 
@@ -43,7 +49,8 @@ def test_normal_equations_with_shared_jitters_are_those_of_the_dense_covariance(
     columns = rng.standard_normal((len(data.value), 2))
     power, timing = rng.standard_normal(len(data.value)), rng.standard_normal(len(data.value))
     noise = NoiseModel(dict.fromkeys(data.kinds, NOISE), 0.7, 0.5, dict.fromkeys(data.kinds, 0.4), True)
-    ours = compute_normal_equations(data, columns, noise, power, timing).gram
+    ours = compute_normal_equations(data, columns, noise, JitterSensitivity(power, timing))
+    expected = np.zeros((2, 2))
     for run in range(len(data.runs)):
         rows = [block for block in data.blocks if block.run == run]
         at = np.concatenate([np.arange(block.part.start, block.part.stop) for block in rows])
@@ -54,7 +61,8 @@ def test_normal_equations_with_shared_jitters_are_those_of_the_dense_covariance(
             covariance[part, part] = dense(block.t_s, NOISE) + 0.16
             low = part.stop
         covariance += 0.49 * np.outer(power[at], power[at]) + 0.25 * np.outer(timing[at], timing[at])
-        assert ours[run] == pytest.approx(columns[at].T @ np.linalg.solve(covariance, columns[at]), rel=1e-8)
+        expected += columns[at].T @ np.linalg.solve(covariance, columns[at])
+    assert ours == pytest.approx(expected, rel=1e-8)
 
 
 def test_projecting_out_leaves_what_least_squares_leaves():
@@ -102,7 +110,7 @@ def test_noise_and_jitter_never_exceed_what_repeats_show(terms, repeats):
     data = build_dataset(lab(6, terms, repeats=repeats))
     problem, base = fit_nominal(data)
     sensitivity = compute_jitter_sensitivity(data, base.point, base.prediction)
-    contrasts = compute_contrasts(data, data.value - base.prediction, sensitivity.power, sensitivity.timing)
+    contrasts = compute_contrasts(data, data.value - base.prediction, sensitivity)
     noise, powers = problem.noise, []
     for kind in data.kinds:
         spread = []
