@@ -12,7 +12,7 @@ import pytest
 
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.daemon.engine import plan_queue, queue_state
+from optodrive.daemon.engine import plan_rest, queue_state
 from optodrive.daemon.engine.plan_rest import EndedPlan, EndedPlans, rewind_estimate
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.link_service import LinkService
@@ -299,5 +299,5 @@ def forget_heat(plan, budget, on_progress):
 
 def test_what_the_lost_board_may_have_emitted_counts_as_heat(monkeypatch):
     assert 0.85 < compute_touched(monkeypatch) <= 1.0
-    monkeypatch.setattr(plan_queue, "estimate_before_rest", forget_heat)
+    monkeypatch.setattr(plan_rest, "estimate_before_rest", forget_heat)
     assert compute_touched(monkeypatch) > 1.5

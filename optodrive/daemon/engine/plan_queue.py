@@ -29,12 +29,12 @@ from optodrive.daemon.engine.plan_making import ExtendedPlan, PlanningSnapshot, 
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.plan_rest import (
     EndedPlans,
+    Restart,
     SavedThermalState,
-    estimate_before_rest,
     restart_plans,
     rewind_estimate,
 )
-from optodrive.daemon.engine.queue_state import LightEnd, PlanEnd, PlanRun, QueueState, Restart
+from optodrive.daemon.engine.queue_state import LightEnd, PlanEnd, PlanRun, QueueState
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.daemon.responses.state import QueuedPlan, QueueReport, RecentPlan
 from optodrive.link.protocol.stage_points import PointCut
@@ -99,7 +99,7 @@ class PlanQueue:
         if state is self.state:
             return
         before = {plan.plan_id: plan.record for plan in self.state.plans}
-        self.state = state.clear_ended()
+        self.state = replace(state, ended=())
         for plan in (*(end.plan for end in state.ended), *state.plans):
             known = before.get(plan.plan_id)
             if plan.record is not known:
@@ -287,7 +287,7 @@ class PlanQueue:
         if off_s is not None:
             self._apply(self._collect().interrupt(off_s, self._session.lost, self._find_light_end()))
         if self.state.off_s is not None and not self.state.waiting and not self.is_held:
-            self._apply(self.state.go_on())
+            self._apply(self.state.hold(None))
         self._apply(self.state.update_runs([self.accounts.read_progress(run) for run in self.state.running]))
         # All of them: one report may end several short plans.
         while self.state.running and self.state.running[0].job.is_finished:
@@ -371,19 +371,16 @@ class PlanQueue:
         if not self.can_restart:
             return None
         start_s = self._session.board_s() + START_LEAD_S + planning_time_s
-        before = estimate_before_rest(state.waiting[0], display.budget, on_progress)
-        scales = self._session.scales
-        restarted = restart_plans(display, scales, state.waiting, before, start_s, START_LEAD_S, on_progress)
-        return Restart(state.waiting, restarted, state.off_s)
+        return restart_plans(display, self._session.scales, state.waiting, start_s, START_LEAD_S, on_progress)
 
     def commit_restart(self, restart: Restart) -> bool:
         """Let the queue go on. Return False if the queue has changed meanwhile, or the light is paused again."""
         self._session.connection.receive()  # a STOP or a pause that has been answered is known from here on
-        state = self.state
-        if not self.can_restart or state.waiting != restart.plans or state.off_s != restart.off_s:
+        # A plan is another value after each change of the heat before it; what a further pause took is a delay.
+        if not self.can_restart or self.state.waiting != restart.plans:
             return False
-        delay_s = max(0.0, self._session.board_s() + START_LEAD_S - restart.restarted[0].start_s)
-        self._apply(state.resume(restart, delay_s))
+        delay_s = max(0.0, self._session.board_s() + START_LEAD_S - restart.start_s)
+        self._apply(self.state.resume(restart, delay_s))
         return True
 
     # --- streams ------------------------------------------------------------------------------------------------

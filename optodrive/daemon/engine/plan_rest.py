@@ -189,38 +189,40 @@ def _build_train(planned: PlannedSequence, source: int, first_row: int, origin_s
     return replace(train, start_s=start_s, duration_s=train.duration_s - float(cycle[is_left].min()) * period_s)
 
 
-class RestartedPlan(NamedTuple):
-    """A plan as it goes on.
+class Restart(NamedTuple):
+    """Plans in their order before and after they were made again.
 
-    start_s: board time at which its points begin; after: state after it, in board time; end_s: of its last pulse
+    start_s: board time at which the first one's points begin; end_s: of the last pulse; after: heat and budget then
     """
 
-    plan: ActivePlan
+    plans: tuple[ActivePlan, ...]
+    restarted: tuple[ActivePlan, ...]
     start_s: float
-    after: ThermalEstimate
     end_s: float
+    after: ThermalEstimate
 
 
 def restart_plans(
     display: DisplayModel,
     scales: Sequence[WireScale],
-    plans: Sequence[ActivePlan],
-    before: ThermalEstimate,
+    plans: tuple[ActivePlan, ...],
     start_s: float,
     gap_s: float,
     on_progress: Callable[[], None],
-) -> list[RestartedPlan]:
+) -> Restart:
     """Limit and prove plans that follow each other.
 
-    before: state before the first; start_s: board time at which the first begins; gap_s: between two plans
+    start_s: board time at which the first one begins, once the light before it is over; gap_s: between two plans
     Raise LocalProtocolError if the bytes of one exceed a cap, and what on_progress raises.
     """
-    restarted = []
+    restarted: list[ActivePlan] = []
+    estimate = estimate_before_rest(plans[0], display.budget, on_progress)
+    start_s = end_s = max(start_s, estimate.budget.at_s)
     for plan in plans:
-        start_s = max(start_s, before.budget.at_s)
-        restarted.append(_restart(display, scales, plan, before, start_s, on_progress))
-        before, start_s = restarted[-1].after, restarted[-1].end_s + gap_s
-    return restarted
+        begin_s = start_s if not restarted else max(end_s + gap_s, estimate.budget.at_s)
+        again, estimate, end_s = _restart(display, scales, plan, estimate, begin_s, on_progress)
+        restarted.append(again)
+    return Restart(plans, tuple(restarted), start_s, end_s, estimate)
 
 
 def _restart(
@@ -230,7 +232,11 @@ def _restart(
     before: ThermalEstimate,
     start_s: float,
     on_progress: Callable[[], None],
-) -> RestartedPlan:
+) -> tuple[ActivePlan, ThermalEstimate, float]:
+    """Return a plan as it goes on, heat and budget after it, and the board time of its end.
+
+    before: heat and budget before it, in board time; start_s: at which its points begin
+    """
     first, planned = plan.first_row, plan.planned
     if plan.growth is not None:
         plan.growth.on_progress = lambda _: on_progress()
@@ -267,7 +273,7 @@ def _restart(
         origin_s=zero_s,
         initial_pixels=None,
     )
-    return RestartedPlan(restarted, start_s, after, start_s + rest.end_s)
+    return restarted, after, start_s + rest.end_s
 
 
 def _is_made_for(display: DisplayModel, plan: ActivePlan) -> bool:

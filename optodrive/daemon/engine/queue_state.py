@@ -39,7 +39,7 @@ from optodrive.core.types.arrays import BoolArray
 from optodrive.daemon.engine.active_plan import ActivePlan, PlanRows, ThermalEstimate
 from optodrive.daemon.engine.plan_rest import (
     EndedPlans,
-    RestartedPlan,
+    Restart,
     estimate_before_rest,
     rewind_estimate,
 )
@@ -75,14 +75,6 @@ class LightEnd(NamedTuple):
 
     dark_s: float
     gate_off_s: float
-
-
-class Restart(NamedTuple):
-    """Plans in their order before and after they were made again, and the board time at which the light went off."""
-
-    plans: tuple[ActivePlan, ...]
-    restarted: Sequence[RestartedPlan]
-    off_s: float | None
 
 
 def find_emitted(run: PlanRun, lost: LostStage) -> BoolArray:
@@ -230,10 +222,6 @@ class QueueState:
         is_news = any(new is not old for new, old in zip(runs, self.running, strict=True))
         return replace(self, running=tuple(runs)) if is_news else self
 
-    def clear_ended(self) -> "QueueState":
-        """Forget the plans that ended, when they have been told."""
-        return replace(self, ended=()) if self.ended else self
-
     def finish(self, light: LightEnd) -> "QueueState":
         """End the first running plan, all of whose points are executed. A late end delays all plans behind it."""
         plan = self.running[0].plan
@@ -286,12 +274,11 @@ class QueueState:
 
     # --- pauses and lost stages ---------------------------------------------------------------------------------
 
-    def go_on(self) -> "QueueState":
-        """Let plans begin again: none waits that is to be made again first."""
-        return replace(self, off_s=None)
+    def hold(self, off_s: float | None) -> "QueueState":
+        """Let nothing begin until the waiting plans are made again.
 
-    def hold(self, off_s: float) -> "QueueState":
-        """Let nothing begin until the waiting plans are made again. off_s: board time from which that counts."""
+        off_s: board time from which that counts, None to let plans begin again
+        """
         return replace(self, off_s=off_s)
 
     def interrupt(self, off_s: float, lost: LostStage | None, light: LightEnd) -> "QueueState":
@@ -324,9 +311,8 @@ class QueueState:
 
     def resume(self, restart: Restart, delay_s: float) -> "QueueState":
         """Go on with the waiting plans as they were made again, delay_s later than they were limited for."""
-        last = restart.restarted[-1]
-        waiting = tuple(each.plan.delay_points(delay_s) for each in restart.restarted)
-        return self._count(last.after.shift(delay_s), last.end_s + delay_s, waiting=waiting, off_s=None)
+        waiting = tuple(plan.delay_points(delay_s) for plan in restart.restarted)
+        return self._count(restart.after.shift(delay_s), restart.end_s + delay_s, waiting=waiting, off_s=None)
 
     # --- heat and time ------------------------------------------------------------------------------------------
 

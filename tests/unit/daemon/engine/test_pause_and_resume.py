@@ -207,6 +207,18 @@ def test_a_stream_after_the_resumption_replaces_the_rest(rig):
     assert len(rig.list_emitted()) == record.executed_count + newest.executed_count
 
 
+def test_a_resumed_plan_that_a_stream_replaces_drops_only_what_was_not_executed(rig):
+    """Its pulses from before the pause count, in its report and in the budget."""
+    record = submit(rig, build_train(3.0))
+    rig.until(lambda: record.executed_count > 40)
+    command(rig, "pause")
+    command(rig, "resume")
+    rig.until(lambda: record.status == "running" and record.executed_count > 60)
+    newest = finish(rig, submit(rig, build_frame(), streamed=True))
+    assert (record.status, newest.status) == ("superseded", "done")
+    assert record.executed_count <= record.pulse_count - record.dropped <= record.sent
+
+
 def test_a_paused_plan_can_be_cancelled_and_the_next_goes_on(rig):
     record, following = submit(rig, build_train(9.0)), submit(rig, build_train(0.3, pixel=5))
     rig.until(lambda: record.executed_count > 5)

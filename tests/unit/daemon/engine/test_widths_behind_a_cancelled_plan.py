@@ -50,6 +50,6 @@ def test_its_pulses_reach_their_heights(monkeypatch):
 def test_widths_for_the_heat_of_the_cancelled_plan_are_caught(monkeypatch):
     """Mutant: the plan is not planned again."""
     cancel = QueueState.cancel
-    monkeypatch.setattr(QueueState, "cancel", lambda *arguments: cancel(*arguments).go_on())
+    monkeypatch.setattr(QueueState, "cancel", lambda *arguments: cancel(*arguments).hold(None))
     heights_m = play_behind_a_cancelled_plan(monkeypatch)
     assert heights_m.min() < 300e-6 - 2.0 * HEIGHT_ERROR_MAX_M
