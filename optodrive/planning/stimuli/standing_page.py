@@ -7,9 +7,9 @@ needs. As soon as a pixel under a finger is due, all of them that are due within
 beam time until the next of them is due goes to the rest of the page in the same way, unless so few pixels fit that they
 are not worth the mirrors' way. How many are due does not matter: they are due together once they were drawn together.
 
-All moves follow one tour of the page, because long ways heat the mirrors, which then must pause. A burst begins where
-light is missing for longest, and goes on along the tour: a newer refresh, which replaces the end of a burst, goes on
-from there. Bursts without a pause between them are one frame.
+All moves follow one tour of the page, because long ways heat the mirrors, which then must pause. A burst under fingers
+goes on along the tour from where the beam stands, unless a pixel is late by LATE_S. Then, and in the rest of the page,
+it begins where light is missing for longest. Bursts without a pause between them are one frame.
 """
 
 from math import inf
@@ -24,6 +24,8 @@ from optodrive.planning.stimuli.frame_json import FRAME_DURATION_S
 REFRESH_PERIOD_S = 0.04
 """Time from one pulse of a pixel to its next turn. Touch tells less than 20 per second from a standing dot."""
 BURST_S = 0.012
+LATE_S = 0.005
+"""A pixel under a finger that is due for this time is drawn first."""
 SLOT_S = 0.01
 """Light is planned for a number of slots, in each of which the places of the fingers are taken as fixed."""
 SLOT_ROUNDING = 1e-9
@@ -74,7 +76,8 @@ def select_bursts(
         next_s, next_rest_s = float(due_touched_s.min(initial=inf)), float(due_rest_s.min(initial=inf))
         stands_at = int(np.argmax(due_s))  # the pixel that was drawn last
         stands_on_touched = bool(touched[stands_at])
-        is_in_burst = stands_on_touched and now_s < due_s[stands_at] - period_s + 2.0 * pixel_time_s
+        has_just_drawn = now_s < due_s[stands_at] - period_s + 2.0 * pixel_time_s
+        is_in_burst = stands_on_touched and has_just_drawn
         if is_in_burst and next_s <= now_s + pixel_time_s and np.argmin(due_touched_s) != stands_at:
             next_s = now_s  # the burst goes on, though a newer refresh has cut it
         if min(next_s, next_rest_s) > now_s:
@@ -86,7 +89,10 @@ def select_bursts(
         if count < count_min and until_s < horizon_s:
             now_s = next_s
             continue
-        chosen = _take_stretch(turn_s, max(now_s + BURST_S, float(turn_s.min())), max(1, count))
+        stalest_s = float(turn_s.min())
+        goes_on = next_s <= now_s and has_just_drawn and stalest_s > now_s - LATE_S
+        first = stands_at + 1 if goes_on else int(np.argmin(turn_s))
+        chosen = _take_stretch(turn_s, max(now_s + BURST_S, stalest_s), first, max(1, count))
         bursts.append(Burst(now_s, tour[chosen]))
         due_s[chosen] = now_s + np.arange(len(chosen)) * pixel_time_s + period_s
         now_s += len(chosen) * pixel_time_s
@@ -105,10 +111,10 @@ def _count_fitting(span_s: float, pixel_time_s: float) -> int:
     return int((span_s - WAY_S + max(0.0, pixel_time_s - WASTED_MAX_S)) / pixel_time_s)
 
 
-def _take_stretch(due_s: FloatArray, until_s: float, count: int) -> IntArray:
-    """Return up to `count` places of a tour that are due until a time, from the one that is due for longest on."""
+def _take_stretch(due_s: FloatArray, until_s: float, first: int, count: int) -> IntArray:
+    """Return up to `count` places of a tour that are due until a time, from the place `first` on."""
     due = np.flatnonzero(due_s <= until_s)
-    return np.roll(due, -int(np.argmin(due_s[due])))[:count]
+    return np.roll(due, -int(np.searchsorted(due, first)))[:count]
 
 
 def build_refresh(page: TactileFrame, bursts: list[Burst], pixel_time_s: float) -> Refresh:
