@@ -198,10 +198,9 @@ def fit_field(spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None = N
 
     noise_m: noise of a spot per axis, m; fitted if None.
     """
-    terms, noise_start_m = evaluate_terms(prior.extent, spots.x_code, spots.y_code), noise_m or prior.noise_m
-    fit = FieldFit(
-        spots, prior, terms, noise_start_m, prior.surface_m, np.zeros(PARAMETER_COUNT), np.ones(len(spots))
-    ).anneal()
+    terms = evaluate_terms(prior.extent, spots.x_code, spots.y_code)
+    scales = noise_m or prior.noise_m, prior.surface_m
+    fit = FieldFit(spots, prior, terms, *scales, np.zeros(PARAMETER_COUNT), np.ones(len(spots))).anneal()
     for _ in range(OUTER_ITERATIONS):
         previous_weight = fit.weight
         fit = fit.converge(fit.noise_m).estimate_scales(noise_m).classify_outliers()

@@ -100,14 +100,12 @@ def draw_residuals(fit: FieldFit) -> str:
     arrows = [
         f"<line x1='{a:.1f}' y1='{b:.1f}' x2='{a + da:.1f}' y2='{b - db:.1f}' class='residual'/>"
         f"<circle cx='{a:.1f}' cy='{b:.1f}' r='1.5' class='bar'/>"
-        for a, b, da, db, true in zip(x, y, dx, dy, is_inlier, strict=True)
-        if true
+        for a, b, da, db in np.column_stack([x, y, dx, dy])[is_inlier]
     ]
     crosses = [
-        f"<text x='{a:.1f}' y='{b + 4:.1f}' text-anchor='middle' style='fill: var(--nominal)'>×"
+        f"<text x='{x[row]:.1f}' y='{y[row] + 4:.1f}' text-anchor='middle' style='fill: var(--nominal)'>×"
         f"<title>row {row}</title></text>"
-        for row, (a, b, true) in enumerate(zip(x, y, is_inlier, strict=True))
-        if not true
+        for row in np.flatnonzero(fit.outlier)
     ]
     caption = f"longest arrow {1e6 * longest_m:.1f} µm; × outlier"
     return _wrap_svg("Residuals", "".join([*arrows, *crosses, _draw_caption(caption)]))

@@ -25,6 +25,8 @@ DISTORTION_PRIOR_SIGMA = (0.03, 0.03, 0.3, 0.3, 0.3)
 CORNER_NOISE_PX = 0.05
 """Expected noise of a corner, px."""
 GAUSS_NEWTON_STEPS = 12
+Camera = tuple[FloatArray, FloatArray]
+"""Matrix and distortion, as OpenCV has them."""
 DERIVATIVE_STEP = 1e-6
 """Step of the central differences."""
 
@@ -58,9 +60,8 @@ def orient_to_marks(where: str, found: FloatArray, origin: OriginSection) -> Flo
         expected = "three corners of the grid: the first, the last of the first row, the last of the first column"
         raise InputError(f"{where}: origin.marks_px", marks.tolist(), expected)
     if along_row[0] * across[1] - along_row[1] * across[0] < 0.0:
-        expected = (
-            "rows to the right and columns down, seen from the front: the picture is flipped or marks are exchanged"
-        )
+        cause = "the picture is flipped or marks are exchanged"
+        expected = f"rows to the right and columns down, seen from the front: {cause}"
         raise InputError(f"{where}: origin.marks_px", "a grid that is mirrored in the picture", expected)
     # The detection may return any of eight orders.
     for flipped in (found, found[::-1], found[:, ::-1], found[::-1, ::-1]):
@@ -140,7 +141,7 @@ class DisplayPlane(ReadOnlyArrays):
 
     centre_px: FloatArray
     half_diagonal_px: float
-    camera: tuple[FloatArray, FloatArray] | None
+    camera: Camera | None
     centre_m: FloatArray
     half_diagonal_m: float
     parameters: FloatArray
@@ -243,9 +244,7 @@ def _jacobian(normalized: FloatArray, parameters: FloatArray) -> FloatArray:
     return (np.stack(later, axis=-1) - np.stack(earlier, axis=-1)) / (2.0 * DERIVATIVE_STEP)
 
 
-def _calibrate_camera(
-    views_px: list[FloatArray], pitch_m: float, size: tuple[int, int]
-) -> tuple[tuple[FloatArray, FloatArray], float]:
+def _calibrate_camera(views_px: list[FloatArray], pitch_m: float, size: tuple[int, int]) -> tuple[Camera, float]:
     """Calibrate the camera from several views: matrix [3, 3] and distortion, and the rms residual per axis, px."""
     rows, columns = views_px[0].shape[:2]
     right, down = np.meshgrid(np.arange(columns), np.arange(rows))
@@ -257,7 +256,7 @@ def _calibrate_camera(
     return camera, float(residual_px) / np.sqrt(2.0)
 
 
-def _undistort(image_px: FloatArray, camera: tuple[FloatArray, FloatArray] | None) -> FloatArray:
+def _undistort(image_px: FloatArray, camera: Camera | None) -> FloatArray:
     """Return the image positions that an undistorted lens would show, px, [n, 2]."""
     if camera is None or not len(image_px):
         return image_px

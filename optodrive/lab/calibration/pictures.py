@@ -158,10 +158,10 @@ def _list_by_table(folder: Path, name: str) -> tuple[SpotPicture, ...]:
         for line, (picture, *cells) in table.rows():
             codes = [table.parse_number(line, column, cell) for column, cell in zip(COLUMNS[1:], cells, strict=True)]
             where = f"{path}: row {line}"
-            for column, code in zip(COLUMNS[1:], codes, strict=True):
-                _check_code(f"{where}: {column}", code)
+            named = zip(COLUMNS[1:], codes, strict=True)
+            x_code, y_code = (_check_code(f"{where}: {column}", code) for column, code in named)
             file = _require_picture(folder, picture.strip(), f"{where}: file")
-            pictures.append(SpotPicture(file, codes[0], codes[1]))
+            pictures.append(SpotPicture(file, x_code, y_code))
     return tuple(pictures)
 
 

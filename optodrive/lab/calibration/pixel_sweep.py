@@ -8,10 +8,9 @@ is killed leaves all earlier lines; a line without its end is dropped on reading
 """
 
 import os
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from queue import SimpleQueue
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -151,9 +150,7 @@ class SweepJournal:
         self.path, self.pulses = path, pulses
         self._file = file
         self._error: OSError | None = None
-        self._lines: SimpleQueue[str | None] = SimpleQueue()
-        self._thread = threading.Thread(target=self._write, name="sweep journal", daemon=True)
-        self._thread.start()
+        self._writer = ThreadPoolExecutor(1, "sweep journal")
 
     @classmethod
     def open(cls, path: Path, display: str) -> Self:
@@ -179,7 +176,7 @@ class SweepJournal:
         """Append pulses without waiting for the disk. Raise InputError if an earlier write failed."""
         self.raise_if_failed()
         self.pulses += pulses
-        self._lines.put("".join(",".join(map(str, pulse)) + "\n" for pulse in pulses))
+        self._writer.submit(self._write, "".join(",".join(map(str, pulse)) + "\n" for pulse in pulses))
 
     def raise_if_failed(self) -> None:
         """Raise InputError if a write failed."""
@@ -188,18 +185,16 @@ class SweepJournal:
 
     def close(self) -> None:
         """Write the remaining lines and close the file."""
-        self._lines.put(None)
-        self._thread.join()
+        self._writer.shutdown()
         os.close(self._file)
 
-    def _write(self) -> None:
-        while (lines := self._lines.get()) is not None:
-            try:
+    def _write(self, lines: str) -> None:
+        try:
+            if self._error is None:
                 os.write(self._file, lines.encode())
                 os.fdatasync(self._file)
-            except OSError as error:
-                self._error = error
-                return
+        except OSError as error:
+            self._error = error
 
 
 def _parse_line(path: Path, number: int, line: str) -> SweepPulse:

@@ -18,6 +18,7 @@ from optodrive.lab.inspection.repeat_faults import SAME_PHASE, find_gains, find_
 from optodrive.lab.inspection.response_faults import RESPONSE_STEPS
 from optodrive.lab.inspection.saturation import find_saturation
 from optodrive.lab.inspection.signal_faults import (
+    Slow,
     find_ceiling,
     find_hold,
     find_interpolation,
@@ -50,8 +51,6 @@ FEW_PARTS = 3
 TEMPERATURE = "absorber_temperature_K"
 HELD = "each sample is repeated until the next, every {every}; the first counts"
 INTERPOLATED = "samples lie on lines between points {every} apart; these points count"
-Slow = tuple[float, FloatArray, FloatArray] | None
-"""Interval of a slower channel, s, and its own times and values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +92,8 @@ def inspect_recording(measurement: Measurement, use: Iterable[str] = ()) -> Insp
     findings: list[DataFinding] = []
     failures: list[str] = []
     for step in STEPS:
-        if step in RESPONSE_STEPS and any(
-            item.kind in RESPONSE_KINDS and item.action == "refused" for item in findings
-        ):
+        is_refused = any(item.kind in RESPONSE_KINDS and item.action == "refused" for item in findings)
+        if step in RESPONSE_STEPS and is_refused:
             continue  # what is refused already would be found once more under other names
         for name in [""] if step.is_joint else work.names:
             try:
@@ -176,10 +174,6 @@ def _find_clipped(work: Work, name: str) -> Found:
             yield edits, f"{name}: {count(samples, 'sample')} ({share:.1%}) of {runs} are at or near {at}, {where}"
 
 
-def _note_start_times(work: Work, _: str) -> Found:
-    yield from read_start_times(work.runs).findings
-
-
 def _note_sampling(work: Work, name: str) -> Found:
     signals = [(number, signal) for number, signal in work.list_signals(name) if len(signal.t_s) > 2]
     if not signals:
@@ -250,7 +244,7 @@ STEPS = (
     *RESPONSE_STEPS,
     Step("lost", find_lost, is_joint=True),
     Step("gain", find_gains),
-    Step(START_TIMES, _note_start_times, is_joint=True),
+    Step(START_TIMES, lambda work, _: iter(read_start_times(work.runs).findings), is_joint=True),
     Step("sampling", _note_sampling),
     Step("noise", _note_noise),
 )

@@ -112,9 +112,8 @@ def _fit_bend(members: list[_Means], name: str, value: FloatArray, *, is_own: bo
 def _bend(x: FloatArray) -> FloatArray:
     """Return by how much the response exceeds each bend [n, widths × bends]."""
     over = x[:, None] - BENDS
-    return np.concatenate(
-        [width * np.logaddexp(0.0, over / width) if width else np.maximum(over, 0.0) for width in BEND_WIDTHS], axis=1
-    )
+    exceeding = [width * np.logaddexp(0.0, over / width) if width else np.maximum(over, 0.0) for width in BEND_WIDTHS]
+    return np.concatenate(exceeding, axis=1)
 
 
 def _list_means(work: Work, name: str) -> list[_Means]:

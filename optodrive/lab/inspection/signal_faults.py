@@ -76,6 +76,8 @@ MAX_WIDTH = 3
 """Largest number of samples of an outlier."""
 ROUGHNESS = 6.0
 """Ratio to the deviations of its neighbours."""
+Slow = tuple[float, FloatArray, FloatArray] | None
+"""Interval of a slower channel, s, and its own times and values."""
 
 
 @dataclass(frozen=True)
@@ -216,9 +218,7 @@ def select_near_ceiling(value: FloatArray, ceiling: float, reach: float) -> Bool
     return np.asarray(np.convolve(is_near, np.ones(5), mode="same") > 0.5)
 
 
-def find_hold(
-    t_s: FloatArray, value: FloatArray, few: int = HOLD_BLOCKS
-) -> tuple[float, FloatArray, FloatArray] | None:
+def find_hold(t_s: FloatArray, value: FloatArray, few: int = HOLD_BLOCKS) -> Slow:
     """Return the interval of a slower channel whose samples are repeated, s, its times and values, or None.
 
     few: smallest number of blocks of samples, `FEW_BLOCKS` suffice where they are long
@@ -245,9 +245,7 @@ def find_hold(
     return period_s, t_s[starts[1:]], value[starts[1:]]  # the first block began before the recording
 
 
-def find_interpolation(
-    t_s: FloatArray, value: FloatArray, few: int = MIN_SEGMENTS
-) -> tuple[float, FloatArray, FloatArray] | None:
+def find_interpolation(t_s: FloatArray, value: FloatArray, few: int = MIN_SEGMENTS) -> Slow:
     """Return the interval of a slower channel whose samples are joined by lines, s, its times and values, or None.
 
     few: smallest number of lines
@@ -299,7 +297,7 @@ def find_outlier_candidates(t_s: FloatArray, value: FloatArray, quantum: float =
     noise = measure_noise(value)
     floor = max(0.5 * noise.quantum, quantum, 1e-9 * float(np.abs(value).max()), 1e-300)
     left = [_predict(t_s, value, k) for k in range(1, MAX_WIDTH + 1)]
-    right = [_mirror(_predict(-t_s[::-1], value[::-1], k)) for k in range(1, MAX_WIDTH + 1)]
+    right = [_predict(-t_s[::-1], value[::-1], k)[::-1] for k in range(1, MAX_WIDTH + 1)]
     scores = []
     for sides in (left, right):
         deviations = [value - predicted for predicted in sides]
@@ -340,10 +338,6 @@ def _predict(t_s: FloatArray, value: FloatArray, ahead: int) -> FloatArray:
     near = target_s - times[:, 0] < 2.0 * (SIDE + ahead) * float(np.median(np.diff(t_s)))
     out[SIDE - 1 + ahead :] = np.where(near, mean + slope * (target_s - centre_s), np.nan)
     return out
-
-
-def _mirror(values: FloatArray) -> FloatArray:
-    return values[::-1]
 
 
 def _is_isolated(t_s: FloatArray, value: FloatArray, first: int, width: int, sigma: float) -> bool:

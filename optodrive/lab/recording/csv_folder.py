@@ -42,7 +42,11 @@ class CsvTree(RecordingTree):
         """Read `recording.toml`."""
         self.path = path
         self._budget = MemoryBudget()
-        self._toml = _read_toml(path / TOML_NAME)
+        described = path / TOML_NAME
+        if not described.is_file():
+            expected = "a TOML file that describes the recording"
+            raise InputError(str(described), Unquoted("no file of this name"), expected)
+        self._toml = read_toml(described, TOML_BYTES_MAX)
 
     def __exit__(self, *details: object) -> None:
         """Do nothing. No file stays open."""
@@ -65,7 +69,10 @@ class CsvTree(RecordingTree):
     def list_members(self, run: str) -> list[str]:
         """Return the names of a run's tables and signals, from `recording.toml` and from the files."""
         tables = [name for name, value in self._get_run_table(run).items() if isinstance(value, dict)]
-        return list(dict.fromkeys([*tables, *self._list_files(run)]))
+        folder = self.path / run
+        with convert_errors(self.format_place(run), "a readable folder"):
+            files = sorted(folder.glob("*.csv")) if folder.is_dir() else []
+        return list(dict.fromkeys([*tables, *(file.stem for file in files if not file.name.startswith("."))]))
 
     def read_table(self, run: str, name: str) -> FloatArray:
         """Return a table of a run, [n, columns]."""
@@ -90,23 +97,13 @@ class CsvTree(RecordingTree):
             raise InputError(f"{self.path / TOML_NAME}: runs", runs, "one table per run: [runs.NAME]")
         return runs
 
-    def _list_files(self, run: str) -> list[str]:
-        folder = self.path / run
-        with convert_errors(self.format_place(run), "a readable folder"):
-            files = sorted(folder.glob("*.csv")) if folder.is_dir() else []
-            return [file.stem for file in files if not file.name.startswith(".")]
-
-    def _find_file(self, run: str, name: str) -> Path:
-        path = self.path / run / f"{name}.csv"
-        with convert_errors(self.format_place(run, name), "a readable file"):
-            if not path.is_file():
-                raise InputError(self.format_place(run, name), None, f"the file {run}/{name}.csv")
-        return path
-
     @contextmanager
     def _open_table(self, run: str, name: str, columns: tuple[str, ...]) -> Iterator[CsvTable]:
         """Open a table or a signal, whose value may also have the signal's name."""
-        path, place = self._find_file(run, name), self.format_place(run, name)
+        path, place = self.path / run / f"{name}.csv", self.format_place(run, name)
+        with convert_errors(place, "a readable file"):
+            if not path.is_file():
+                raise InputError(place, None, f"the file {run}/{name}.csv")
         with (
             convert_errors(place, f"CSV: {','.join(columns)}"),
             open_table(path, columns, place, {"value": name} if columns == SAMPLE_COLUMNS else {}) as table,
@@ -117,12 +114,6 @@ class CsvTree(RecordingTree):
         place = self.format_place(run, name)
         with self._open_table(run, name, columns) as table:
             return table.read_numbers(missing, lambda: self._budget.reserve(place, len(columns)))
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(str(path), Unquoted("no file of this name"), "a TOML file that describes the recording")
-    return read_toml(path, TOML_BYTES_MAX)
 
 
 @contextmanager

@@ -29,6 +29,8 @@ def build_summary(measurement: Measurement) -> list[dict[str, Any]]:
 
 def _summarize_run(run: Run) -> dict[str, Any]:
     group = run.attributes.get("group")
+    with np.errstate(over="ignore"):
+        energy_j = float(np.sum(run.pulses[:, 1] * run.pulses[:, 2]))
     return {
         "run": run.name,
         "group": None if group is None else str(group),
@@ -36,15 +38,10 @@ def _summarize_run(run: Run) -> dict[str, Any]:
         "attributes": {key: to_json(value) for key, value in run.attributes.items()},
         "pulses": len(run.pulses),
         "pulsed_pixels": [int(pixel) for pixel in np.unique(run.pulses[:, 3])],
-        "energy_J": to_json(_compute_energy_j(run.pulses)),
+        "energy_J": to_json(energy_j),
         "commands": None if run.commands is None else len(run.commands),
         "signals": {name: _summarize_signal(signal) for name, signal in run.signals.items()},
     }
-
-
-def _compute_energy_j(pulses: FloatArray) -> float:
-    with np.errstate(over="ignore"):
-        return float(np.sum(pulses[:, 1] * pulses[:, 2]))
 
 
 def _summarize_signal(signal: Signal) -> dict[str, Any]:
@@ -80,7 +77,8 @@ def _draw(measurement: Measurement) -> tuple[Any, int]:
     size = (_compute_panel_left(len(columns)), HEAD_HEIGHT + len(runs) * height)
     image = Image.new("RGB", size, BACKGROUND_COLOUR)
     draw = ImageDraw.Draw(image)
-    draw.text((GAP, 8), _format_title(len(runs), len(measurement.runs)), fill=FRAME_COLOUR)
+    shown = "" if len(runs) == len(measurement.runs) else f"{len(runs)} of "
+    draw.text((GAP, 8), f"{shown}{len(measurement.runs)} runs", fill=FRAME_COLOUR)
     for column, name in enumerate(columns):
         draw.text((_compute_panel_left(column), 8), name, fill=TEXT_COLOUR)
     for row, run in enumerate(runs):
@@ -90,10 +88,6 @@ def _draw(measurement: Measurement) -> tuple[Any, int]:
 
 def _compute_panel_left(column: int) -> int:
     return NAME_WIDTH + LABEL_WIDTH + column * (PANEL_WIDTH + GAP + LABEL_WIDTH)
-
-
-def _format_title(plotted: int, count: int) -> str:
-    return f"{count} runs" if plotted == count else f"{plotted} of {count} runs"
 
 
 def _draw_run(draw: "ImageDraw", run: Run, columns: list[str], top: int, height: int) -> None:

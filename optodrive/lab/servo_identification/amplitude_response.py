@@ -5,7 +5,7 @@ One model of all amplitudes is a `ModalResponse`.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -45,19 +45,18 @@ LEVEL_TOLERANCE = 0.05
 SEPARATE, FITTED_WITHOUT = "one_response_each", "fitted_without"
 """Errors of one linear response per amplitude, and of the model that was fitted without an amplitude."""
 RESONANCES_SHOWN = 6
+Predict = Callable[[FloatArray], FloatArray]
 
 
-def errors_by_level(
-    responses: PeriodicResponses, predict: Callable[[FloatArray], FloatArray], rows: BoolArray
-) -> dict[float, float]:
+def errors_by_level(responses: PeriodicResponses, predict: Predict, rows: BoolArray) -> dict[float, float]:
     """Return the rms error of the realisations in rows by amplitude, over all samples and outputs."""
     error2 = ((responses.y[:, :, rows] - predict(responses.u[:, :, rows])) ** 2).mean(axis=(0, 1))
     return {float(level): float(np.sqrt(each)) for level, each in zip(responses.level[rows], error2, strict=True)}
 
 
-def _predict_by(response: Any) -> Callable[[FloatArray], FloatArray]:
+def _predict_by(response: Any, u: FloatArray) -> FloatArray:
     """Return the prediction [n, o, r] from drives [n, i, r] of one linear response."""
-    return lambda u: np.asarray(np.fft.irfft(response @ np.fft.rfft(u, axis=0), len(u), axis=0))
+    return np.asarray(np.fft.irfft(response @ np.fft.rfft(u, axis=0), len(u), axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +89,7 @@ class AmplitudeData:
         if len(static) < 16:
             static = self.lines[:16]
         parts = ((first[each], last[each]) for each in np.array_split(static, 8))
-        bands = [
-            complex((after * np.conj(before)).sum() / (np.abs(before) ** 2).sum()) - 1.0 for before, after in parts
-        ]
+        bands = [complex((b * np.conj(a)).sum() / (np.abs(a) ** 2).sum()) - 1.0 for a, b in parts]
         ratios = [each.imag / each.real for each in bands]
         return complex(np.mean(bands)), float(np.std(ratios) / np.sqrt(len(bands)))
 
@@ -169,7 +166,7 @@ def assess_coupled(responses: PeriodicResponses) -> CoupledAxes:
     law = min(LAGS, key=lambda each: mean2[each])
     for row in range(len(data.levels)):
         rows = held_out & (group == row)
-        errors[SEPARATE] |= errors_by_level(responses, _predict_by(data.responses[row]), rows)
+        errors[SEPARATE] |= errors_by_level(responses, partial(_predict_by, data.responses[row]), rows)
         without = errors_by_level(responses, data.without(row).fit(law).predict, rows)
         errors[FITTED_WITHOUT] |= without
         if 0 < row < len(data.levels) - 1:

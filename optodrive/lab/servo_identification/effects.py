@@ -313,9 +313,8 @@ def sample_angle(states: FloatArray, begin_s: float, h_s: float, t_s: FloatArray
         left, right = states[row, 0], states[row + 1, 0]
         rate_left, rate_right = h_s * states[row, 1], h_s * states[row + 1, 1]
         bend = right - left
-        out[at] = left + x * (
-            rate_left + x * (3.0 * bend - 2.0 * rate_left - rate_right + x * (rate_left + rate_right - 2.0 * bend))
-        )
+        cubic = rate_left + rate_right - 2.0 * bend
+        out[at] = left + x * (rate_left + x * (3.0 * bend - 2.0 * rate_left - rate_right + x * cubic))
 
 
 def propagate(omega: float, zeta: float, h_s: float) -> FloatArray:

@@ -17,7 +17,7 @@ from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.amplitude_response import CoupledAxes
 from optodrive.lab.servo_identification.effect_fit import LINEAR, OTHER, STEPS_MAX, STEPS_PER_TIME_CONSTANT, Linearity
-from optodrive.lab.servo_identification.effects import SLEW_LIMIT, NonlinearServo, build_drive
+from optodrive.lab.servo_identification.effects import SLEW_LIMIT, NonlinearServo, Pair, build_drive
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 
 DAMPING_MIN, COMMON_DAMPING_MAX = 0.3, 0.9
@@ -44,6 +44,11 @@ VISITS = 40
 """Moves between random positions, whose histories a hysteresis remembers."""
 RESIDUAL_SIGMAS = 3.0
 UNRESOLVED = "unresolved"
+Mirrors = tuple[IdentifiedServo, IdentifiedServo]
+Move = tuple[float, float, int]
+"""Size and tolerance, rad, and axis."""
+Settle = Callable[[int, float, float], float]
+"""Settling time, s, by axis, size and tolerance of a move."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +61,11 @@ class CommonServo:
 
     servo: Servo
     galvo_share: float
-    settling_excess: tuple[float, float]
+    settling_excess: Pair
 
 
 def find_common_servo(
-    mirrors: tuple[IdentifiedServo, IdentifiedServo],
-    config: Config,
-    settle: Callable[[int, float, float], float] = lambda axis, move_rad, tolerance_rad: 0.0,
+    mirrors: Mirrors, config: Config, settle: Settle = lambda axis, move_rad, tolerance_rad: 0.0
 ) -> CommonServo:
     """Find the servo with the smallest mean settling time that covers the 95 % intervals of both mirrors.
 
@@ -84,7 +87,7 @@ def find_common_servo(
     return CommonServo(servo, min(1.0, 1.0 / sqrt(ratio)), _settling_excess(mirrors, servo, moves))
 
 
-def _list_moves(config: Config) -> list[tuple[float, float, int]]:
+def _list_moves(config: Config) -> list[Move]:
     """Return size, tolerance and axis of the moves at which settling is compared."""
     return [
         (step_rad, share * tolerance_rad, axis)
@@ -94,9 +97,7 @@ def _list_moves(config: Config) -> list[tuple[float, float, int]]:
     ]
 
 
-def bound_coupled_moves(
-    axes: CoupledAxes, angle_per_output: FloatArray, config: Config
-) -> tuple[Servo, tuple[float, float]]:
+def bound_coupled_moves(axes: CoupledAxes, angle_per_output: FloatArray, config: Config) -> tuple[Servo, Pair]:
     """Return a servo that settles no sooner than coupled axes at any measured amplitude, and the errors that stay, rad.
 
     angle_per_output: [2, o]. Commands are those that turn the mirrors by their size at the model's own amplitude, since
@@ -131,9 +132,7 @@ def bound_coupled_moves(
     return _slow_to_required(build_servo(config.scanner), moves, required_s), (float(error_rad[0]), float(error_rad[1]))
 
 
-def find_half_widths(
-    mirrors: tuple[IdentifiedServo, IdentifiedServo], servo: Servo
-) -> tuple[float, float, float, float]:
+def find_half_widths(mirrors: Mirrors, servo: Servo) -> tuple[float, float, float, float]:
     """Return the half-widths of frequency, damping, slew (relative) and delay (s) within which plans take the servo.
 
     They are three standard deviations, and at least what temperature may change; the delay's at least a sample of the
@@ -155,7 +154,7 @@ def move_sizes_rad(config: Config, axis: int) -> list[float]:
     return [pitch_rad * pitch_count for pitch_count in pitches]
 
 
-def _slow_to_required(start: Servo, moves: list[tuple[float, float, int]], required_s: FloatArray) -> Servo:
+def _slow_to_required(start: Servo, moves: list[Move], required_s: FloatArray) -> Servo:
     """Lower the frequency of a servo until it settles as required. Raise InputError below the range of a file."""
     servo = replace(start, damping=min(max(start.damping, DAMPING_MIN), COMMON_DAMPING_MAX))
     while True:
@@ -170,13 +169,11 @@ def _slow_to_required(start: Servo, moves: list[tuple[float, float, int]], requi
         servo = replace(servo, frequency=servo.frequency * FREQUENCY_STEP)
 
 
-def _settling_times_s(servo: Servo, moves: list[tuple[float, float, int]]) -> FloatArray:
+def _settling_times_s(servo: Servo, moves: list[Move]) -> FloatArray:
     return np.array([settling_s(servo, step, tolerance) for step, tolerance, _ in moves])
 
 
-def _settling_excess(
-    mirrors: tuple[IdentifiedServo, IdentifiedServo], servo: Servo, moves: list[tuple[float, float, int]]
-) -> tuple[float, float]:
+def _settling_excess(mirrors: Mirrors, servo: Servo, moves: list[Move]) -> Pair:
     def excess(axis: int) -> float:
         mine = [move for move in moves if move[2] == axis]
         times_s = (_settling_times_s(each, mine).mean() for each in (servo, mirrors[axis].servo))

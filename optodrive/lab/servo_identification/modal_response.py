@@ -258,9 +258,8 @@ class _ModalFit:
         """Return the projection of each input's responses."""
         columns, gains, found = self._columns_by_level(x), self.unpack(x)[2], []
         for row, gain in enumerate(gains):
-            scaled = _stack(
-                np.concatenate([each * (1.0 + gain * a) for each, a in zip(columns, self.law, strict=True)])
-            )
+            levels = [each * (1.0 + gain * a) for each, a in zip(columns, self.law, strict=True)]
+            scaled = _stack(np.concatenate(levels))
             target = _stack(np.concatenate(self.values[:, :, :, row]))
             u, singular, v = np.linalg.svd(scaled, full_matrices=False)
             kept = singular > RANK * singular[0]

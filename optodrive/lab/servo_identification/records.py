@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.errors import MISSING, InputError
-from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import Measurement, Run
 from optodrive.lab.servo_identification.effect_fit import ServoRecord
 
@@ -250,21 +250,13 @@ def _build_records(
     noise = estimate_noise(value)
     until = int(len(t_s) * (1.0 - HELD_OUT_SHARE)) if is_divided else len(t_s)
     for part, held_out in ((slice(0, until), is_held_out), (slice(until, None), True)):
-        use = np.zeros(len(t_s), dtype=np.bool_)
-        use[part] = True
-        use = _keep_every_nth(use)
+        use, every = np.zeros(len(t_s), dtype=np.bool_), np.arange(len(t_s))[part]
+        use[every[:: max(1, -(-len(every) // RANGE_MAX))]] = True
         if use.any():
             end = int(np.flatnonzero(use)[-1]) + 1
             rows = commands[:, 0] <= t_s[end - 1]
             at_s, command = commands[rows, 0], commands[rows, 1 + axis]
             yield ServoRecord(at_s, command, t_s[:end], value[:end], use[:end], held_out, noise, level)
-
-
-def _keep_every_nth(use: BoolArray) -> BoolArray:
-    rows = np.flatnonzero(use)
-    kept = np.zeros_like(use)
-    kept[rows[:: max(1, -(-len(rows) // RANGE_MAX))]] = True
-    return kept
 
 
 def estimate_noise(value: FloatArray) -> float:

@@ -15,7 +15,7 @@ from optodrive.device.servo import Servo
 from optodrive.lab.inference.sentences import describe_sufficiency
 from optodrive.lab.servo_identification.effect_fit import LINEAR, Linearity
 from optodrive.lab.servo_identification.effects import LABELS, SLEW_LIMIT
-from optodrive.lab.servo_identification.gate import CommonServo, MirrorEffect, find_half_widths, move_sizes_rad
+from optodrive.lab.servo_identification.gate import CommonServo, MirrorEffect, Mirrors, find_half_widths, move_sizes_rad
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 from optodrive.lab.servo_identification.records import AXES
 
@@ -35,10 +35,7 @@ HALF_WIDTHS = ("bandwidth_uncertainty", "damping_uncertainty", "slew_uncertainty
 
 
 def build_report(
-    mirrors: tuple[IdentifiedServo, IdentifiedServo],
-    common: CommonServo,
-    config: Config,
-    effects: tuple[MirrorEffect, MirrorEffect],
+    mirrors: Mirrors, common: CommonServo, config: Config, effects: tuple[MirrorEffect, MirrorEffect]
 ) -> dict[str, Any]:
     """Build the report in SI units. Intervals are 95 %."""
     axes = [_axis_report(mirror, config, effect.linearity) for mirror, effect in zip(mirrors, effects, strict=True)]
@@ -181,10 +178,8 @@ def _list_sizes_rad(mirror: IdentifiedServo, config: Config) -> list[float]:
 def _settling_row(mirror: IdentifiedServo, step_rad: float, config: Config) -> dict[str, Any]:
     configured = build_servo(config.scanner)
     row: dict[str, Any] = {"step_rad": step_rad}
-    for name, tolerance_rad in (
-        ("gate", config.tolerance_rad[mirror.trace.axis]),
-        ("share", STEP_TOLERANCE * step_rad),
-    ):
+    tolerances_rad = {"gate": config.tolerance_rad[mirror.trace.axis], "share": STEP_TOLERANCE * step_rad}
+    for name, tolerance_rad in tolerances_rad.items():
         best_s, low_s, high_s = mirror.settling_s(step_rad, tolerance_rad)
         row[name] = {
             "tolerance_rad": tolerance_rad,
@@ -230,13 +225,12 @@ def _axis_remarks(mirror: IdentifiedServo, settling: list[dict[str, Any]], confi
     return [f"{AXES[mirror.trace.axis]}: {remark}" for is_due, remark in remarks if is_due]
 
 
-def _common_servo_remarks(mirrors: tuple[IdentifiedServo, IdentifiedServo], common: CommonServo) -> list[str]:
+def _common_servo_remarks(mirrors: Mirrors, common: CommonServo) -> list[str]:
     x, y = (asdict(mirror.servo) for mirror in mirrors)
     difference = max(abs(x[key] - y[key]) / max(x[key], y[key], 1e-12) for key in ("frequency", "damping", "slew"))
     differ = difference > BANDWIDTH_TOLERANCE or max(common.settling_excess) > SETTLING_TOLERANCE
-    longer = " and ".join(
-        f"{each:.1%} longer than {axis}" for each, axis in zip(common.settling_excess, AXES, strict=True)
-    )
+    of_axes = zip(common.settling_excess, AXES, strict=True)
+    longer = " and ".join(f"{each:.1%} longer than {axis}" for each, axis in of_axes)
     covers = "one servo model covers both mirrors and settles no sooner than either: at the gate it takes"
     factor = f"the galvo cap is multiplied by {common.galvo_share:.3f}"
     remarks = [f"{covers} {longer}"] if differ else []

@@ -5,7 +5,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from math import pi
 from typing import NamedTuple
 
@@ -154,8 +154,8 @@ RESPONSES: dict[str, Callable[[PaperModel], float]] = {
 """Facts that follow from the responses of a model."""
 
 
-def _close(respond: Callable[[PaperModel], float]) -> OutcomeFunction:
-    return lambda s: respond(ClosedForm(s))
+def _respond_closed(respond: Callable[[PaperModel], float], s: ParameterSet) -> float:
+    return respond(ClosedForm(s))
 
 
 def _r_width_product_k_m_per_w(s: ParameterSet) -> float:
@@ -163,12 +163,8 @@ def _r_width_product_k_m_per_w(s: ParameterSet) -> float:
     return sum(r * inverse for r, inverse in rows) / sum(inverse**2 for _, inverse in rows)
 
 
-def _resistance(width_mm: float) -> OutcomeFunction:
-    return lambda s: s.build_pixel(width_mm * 1e-3).r_k_per_w
-
-
-def _capacity(width_mm: float) -> OutcomeFunction:
-    return lambda s: s.build_pixel(width_mm * 1e-3).c_j_per_k
+def _get_of_pixel(key: str, width_mm: float, s: ParameterSet) -> float:
+    return float(getattr(s.build_pixel(width_mm * 1e-3), key))
 
 
 WIDTHS_MM = (0.20, 0.25, 0.40, 0.55, 0.75)
@@ -177,15 +173,17 @@ WIDTHS_MM = (0.20, 0.25, 0.40, 0.55, 0.75)
 INPUTS: dict[str, OutcomeFunction] = {
     "absorbed_power": lambda s: s.epsilon.value * FULL_POWER_W,
     "epsilon": lambda s: s.epsilon.value,
-    **{f"R_w{100.0 * width_mm:03.0f}": _resistance(width_mm) for width_mm in WIDTHS_MM},
-    **{f"C_w{100.0 * width_mm:03.0f}": _capacity(width_mm) for width_mm in WIDTHS_MM},
+    **{f"R_w{100.0 * width_mm:03.0f}": partial(_get_of_pixel, "r_k_per_w", width_mm) for width_mm in WIDTHS_MM},
+    **{f"C_w{100.0 * width_mm:03.0f}": partial(_get_of_pixel, "c_j_per_k", width_mm) for width_mm in WIDTHS_MM},
     "C_mean": lambda s: sum(row.C.value for row in s.bridge) / len(s.bridge),
     "R_of_w": _r_width_product_k_m_per_w,
     "energy_range_high": lambda s: FULL_POWER_W * LONG_PULSE_S,
 }
 """Facts that a set takes from the paper or that follow from it by arithmetic."""
 
-OUTCOMES = {name: _close(respond) for name, respond in RESPONSES.items()} | {"z_repeat_w040": _repeatability_m}
+OUTCOMES: dict[str, OutcomeFunction] = {
+    name: partial(_respond_closed, respond) for name, respond in RESPONSES.items()
+} | {"z_repeat_w040": _repeatability_m}
 """Facts that follow from a set: fitted (FITTED_ON) or predicted."""
 
 NOT_MODELLED = list_stated("not_modelled")

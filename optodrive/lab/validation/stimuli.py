@@ -41,6 +41,10 @@ def width_to_reach_s(pixel: Pixel, power_w: float, height_m: float) -> float:
     return high_s
 
 
+Rises = tuple[float, float]
+"""Of absorber and gas, K."""
+
+
 @dataclass(frozen=True)
 class SteadyTrain:
     """Gas rise, K, of a pulse train in its periodic steady state: minimum, maximum and mean over a period."""
@@ -64,9 +68,7 @@ def compute_steady_train(pixel: Pixel, power_w: float, width_s: float, gap_s: fl
     return SteadyTrain(min_k, max_k, mean_k)
 
 
-def _find_steady_state(
-    pixel: Pixel, power_w: float, on_s: float, off_s: float
-) -> tuple[tuple[float, float], tuple[float, float]]:
+def _find_steady_state(pixel: Pixel, power_w: float, on_s: float, off_s: float) -> tuple[Rises, Rises]:
     """Return the rises of absorber and gas at gate on and at gate off of a steady train."""
 
     def advance_period(theta_k: float, gamma_k: float) -> FloatArray:
