@@ -1,5 +1,7 @@
 """While the gate is on the whole focus lies on the absorber when plans of a stream replace each other at any time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_focus_on_absorber import PLACES, ROUNDING_M, with_servo
@@ -37,10 +39,10 @@ def stream(display, seed):
     plan = make(display, rng, PlanningSnapshot(thermal, 0.0, thermal))
     tables, pixels = [], []
     for number in range(PLANS):
-        may_withdraw = number > 0
+        plan = replace(plan, holds_first=number > 0)
         after_s = rng.uniform(0.0, 0.6) * plan.record.duration_s if number % 2 == 0 else -0.001
         min_start_s = plan.record.start_s + after_s
-        snapshot = build_cut_snapshot(plan, thermal, min_start_s, display.budget, tick_s, may_withdraw)
+        snapshot = build_cut_snapshot(plan, thermal, min_start_s, display.budget, tick_s)
         if snapshot is None:  # it is too late for another plan
             continue
         (points,), (kept,) = plan.points.stages, snapshot.cut.kept_points

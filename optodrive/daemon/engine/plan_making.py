@@ -68,20 +68,19 @@ def build_cut_snapshot(
     min_start_s: float,
     budget: Budget,
     tick_s: float,
-    may_withdraw: bool = False,
     min_end_s: float = inf,
     begin_s: float = -inf,
 ) -> PlanningSnapshot | None:
     """Build the snapshot for truncating a running plan before its first point after board time min_start_s.
 
-    may_withdraw: whether no point of the plan must be left
     min_end_s: board time at which the plan may end for another to follow it if nothing of it can be dropped; that one
     then begins at begin_s
-    Return None if no pulse would be left of a plan that must keep one, or none would be dropped and it ends too early.
+    Return None if no pulse would be left of a plan that does not hold its first point, or none would be dropped and it
+    ends too early.
     """
     plan, zero_s = running.planned.plan, running.record.start_s
     min_tick = (min_start_s - zero_s - running.zero_s) / tick_s
-    cut = PointCut.find(running.points, min_tick if may_withdraw else max(1.0, min_tick))
+    cut = PointCut.find(running.points, min_tick if running.holds_first else max(1.0, min_tick))
     end_s = running.zero_s + cut.end_tick * tick_s
     is_whole = cut.row == len(plan)
     if (is_whole and zero_s + end_s < min_end_s) or (not cut.row and any(cut.kept_points)):

@@ -168,16 +168,8 @@ class PlanQueue:
         planned_s = self._session.board_s() + planning_time_s
         # Several boards end each job together: nothing follows what has left.
         min_end_s = planned_s + APPEND_LEAD_S if len(self._session.scales) == 1 else inf
-        return build_cut_snapshot(
-            running,
-            thermal,
-            planned_s + self.lead_s,
-            self._budget,
-            self._session.tick_s,
-            running.holds_first,
-            min_end_s,
-            begin_s=planned_s + STREAM_START_LEAD_S,
-        )
+        leave_s, begin_s = planned_s + self.lead_s, planned_s + STREAM_START_LEAD_S
+        return build_cut_snapshot(running, thermal, leave_s, self._budget, self._session.tick_s, min_end_s, begin_s)
 
     def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot, cooling_max_m: float = inf) -> PlanRecord | None:
         """Accept a plan into the queue, and return its record. Return None if its snapshot is stale, or it is too late.
@@ -482,7 +474,7 @@ class PlanQueue:
         It leaves out that a plan has ended while the next one runs: the state before both counts the same pulses.
         """
         records = [plan.record for plan in self.state.active[-1:]]
-        return id(self.state.thermal), tuple((record.plan_id, record.dropped, record.start_s) for record in records)
+        return self.state.thermal, tuple((record.plan_id, record.dropped, record.start_s) for record in records)
 
     def restore(self, saved: SavedThermalState, host_s: float) -> None:
         """Continue from the state of an earlier planner, whose plans the link process has ended.

@@ -29,7 +29,8 @@ def running():
 
 
 def cut(running, at_s, may_withdraw=False):
-    return build_cut_snapshot(running, running.before, START_S + at_s, DISPLAY.budget, SCALES[0].tick_s, may_withdraw)
+    plan = replace(running, holds_first=may_withdraw)
+    return build_cut_snapshot(plan, plan.before, START_S + at_s, DISPLAY.budget, SCALES[0].tick_s)
 
 
 @pytest.mark.parametrize("at_s", [-0.01, 0.0])
