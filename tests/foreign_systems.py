@@ -127,42 +127,6 @@ def pendulum_record(seed, stop_rad, noise=1e-3, count=3000, dt_s=0.01):
     return Record(t, samples, angle + noise * rng.standard_normal(count))
 
 
-def tanks_model():
-    """Return two tanks in cascade whose outflow is proportional to the level: level of the lower one from the pump."""
-    return OdeModel(
-        states=("upper", "lower"),
-        inputs=("pump",),
-        outputs=("level",),
-        parameters={
-            "k1": Parameter(0.05, 1e-3, 1.0),
-            "k2": Parameter(0.05, 1e-3, 1.0),
-            "k3": Parameter(0.05, 1e-3, 1.0),
-            "upper0": Parameter(5.0, 0.0, 20.0),
-        },
-        rhs=lambda t, x, u, p: [p["k3"] * u[0] - p["k1"] * x[0], p["k1"] * x[0] - p["k2"] * x[1]],
-        output=lambda x, u, p: [x[1]],
-        initial=lambda first, p: [p["upper0"], first[0, 0]],
-    )
-
-
-def tanks_record(seed, noise=0.02, count=1024, dt_s=4.0, overflow_at=10.0):
-    """Return two tanks with Torricelli's outflow, of which the upper one overflows into the lower one."""
-    rng = np.random.default_rng(seed)
-    t = dt_s * np.arange(count)
-    _, samples = smooth_input(rng, t, 0.012, 1.0)
-    pump = np.clip(3.2 + 1.6 * samples, 0.0, None)
-
-    def rate(time, y):
-        drive = np.interp(time, t, pump)
-        upper, lower = max(y[0], 0.0), max(y[1], 0.0)
-        spill = 0.3 * max(upper - overflow_at, 0.0)
-        out1, out2 = 0.085 * np.sqrt(upper), 0.08 * np.sqrt(lower)
-        return [0.065 * drive - out1 - spill, out1 + 0.5 * spill - out2]
-
-    solution = solve_ivp(rate, (0.0, t[-1]), [6.0, 5.0], t_eval=t, rtol=1e-7, atol=1e-9, max_step=dt_s)
-    return Record(t, pump, solution.y[1] + noise * rng.standard_normal(count))
-
-
 def solve(rate, t, state, inputs=None):
     """Return the states [m, n] at times t, of rate(time, state, u) with inputs [m] that are linear between samples."""
 
@@ -260,28 +224,46 @@ def servo(seed, reference):
     return Record(t, voltages, angle + 1e-3 * rng.standard_normal(len(t)))
 
 
-def coupled_tanks_model():
-    """Return two tanks in cascade with orifices, without an overflow: level of the lower one from the pump."""
+def coupled_tanks_model(is_start_known=True, is_complete=False):
+    """Return two tanks in cascade with orifices: level of the lower one from the pump.
+
+    is_start_known: of the upper tank; is_complete: with an overflow of the upper tank and a ceiling of the level
+    """
+    names = {"k1": 0.06, "k2": 0.06, "k3": 0.05}
+    parameters = {name: Parameter(value, 1e-3, 1.0) for name, value in names.items()}
+    if not is_start_known:
+        parameters["upper0"] = Parameter(5.0, 0.0, 20.0)
+    if is_complete:
+        parameters["spill"] = Parameter(0.1, 1e-3, 10.0)
+        parameters |= {name: Parameter(9.0, 3.0, 20.0) for name in ("brim", "ceiling")}
+
+    def rates(t, x, u, p):
+        out = p["k1"] * np.sqrt(max(x[0], 0.0))
+        return [p["k3"] * u[0] - out, out - p["k2"] * np.sqrt(max(x[1], 0.0))]
+
+    def complete_rates(t, x, u, p):
+        out = p["k1"] * np.sqrt(max(x[0], 0.0))
+        spill = p["spill"] * max(x[0] - p["brim"], 0.0)
+        return [p["k3"] * u[0] - out - spill, out - p["k2"] * np.sqrt(max(x[1], 0.0))]
+
     return OdeModel(
         states=("upper", "lower"),
         inputs=("pump",),
         outputs=("level",),
-        parameters={
-            "k1": Parameter(0.06, 1e-3, 1.0),
-            "k2": Parameter(0.06, 1e-3, 1.0),
-            "k3": Parameter(0.05, 1e-3, 1.0),
-        },
-        rhs=lambda t, x, u, p: [
-            p["k3"] * u[0] - p["k1"] * np.sqrt(max(x[0], 0.0)),
-            p["k1"] * np.sqrt(max(x[0], 0.0)) - p["k2"] * np.sqrt(max(x[1], 0.0)),
-        ],
-        output=lambda x, u, p: [x[1]],
-        initial=lambda first, p: [6.0, first[0, 0]],
+        parameters=parameters,
+        rhs=complete_rates if is_complete else rates,
+        output=(lambda x, u, p: [min(x[1], p["ceiling"])]) if is_complete else (lambda x, u, p: [x[1]]),
+        initial=(lambda first, p: [6.0, first[0, 0]])
+        if is_start_known
+        else (lambda first, p: [p["upper0"], first[0, 0]]),
     )
 
 
-def coupled_tanks(seed, pump):
-    """Return the lower level of two tanks of which the upper one overflows at 10; pump [m] in steps of 4 s."""
+def coupled_tanks(seed, pump, ceiling=np.inf):
+    """Return the lower level of two tanks of which the upper one overflows at 10; pump [m] in steps of 4 s.
+
+    ceiling: level above which the sensor reads no more
+    """
     t = 4.0 * np.arange(len(pump))
 
     def rate(_, y, u):
@@ -289,7 +271,13 @@ def coupled_tanks(seed, pump):
         out1 = 0.085 * np.sqrt(upper)
         return [0.065 * u - out1 - 0.3 * max(upper - 10.0, 0.0), out1 - 0.08 * np.sqrt(lower)]
 
-    return measure(seed, t, solve(rate, t, [6.0, 5.0], pump)[:, 1], 0.02, pump)
+    levels = solve(rate, t, [6.0, 5.0], pump)[:, 1]
+    return measure(seed, t, np.minimum(levels, ceiling), 0.02, pump)
+
+
+def random_pump(seed, count=1024):
+    """Return a pump's voltage [m] in steps of 4 s that fills both tanks to their brims."""
+    return np.clip(3.2 + 1.6 * _noise(seed, count, 1.0, 0.012, 4.0), 0.0, None)
 
 
 def _steps(seed, count, length, low, high):

@@ -23,7 +23,7 @@ def discover(model: ModelArgument, records: RecordsArgument, json: JsonOption = 
     """Find the terms that a simulation lacks, in measured records of any system."""
     import_extra("scipy")
     from optodrive.lab.discovery import discover as search
-    from optodrive.lab.discovery.input_files import load_model, read_record
+    from optodrive.lab.discovery.model import load_model, read_record
 
     simulation = load_model(model)
     train = [read_record(path, simulation) for path in records]

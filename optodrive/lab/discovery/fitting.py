@@ -52,6 +52,10 @@ class Terms:
         """Return the same terms, none of whose numbers is fitted."""
         return replace(self, free=np.zeros_like(self.free))
 
+    def weaken(self, share: float) -> "Terms":
+        """Return the same terms with this share of their amplitudes."""
+        return replace(self, values=self.values * [share, 1.0, 1.0, 1.0])
+
     @property
     def memories(self) -> IntArray:
         """Rows with memory [k], in the order in which their inner states follow the model's."""

@@ -89,6 +89,10 @@ class Form:
         """Return the values [n] at z [n]."""
         return np.array([evaluate_form(self.code, float(each), first, second) for each in z])
 
+    def apply(self, numbers: FloatArray, z: FloatArray) -> FloatArray:
+        """Return the values [n] of a term at z [n]. numbers: amplitude and inner numbers."""
+        return np.asarray(numbers[0] * self.evaluate(z, numbers[1], numbers[2]))
+
     def limit(self, nodes: FloatArray, first: float) -> tuple[float, float]:
         """Return limits of the first inner number from the variable's nodes."""
         size, span = float(np.abs(nodes).max()), float(nodes[-1] - nodes[0])

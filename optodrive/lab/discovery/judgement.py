@@ -6,17 +6,16 @@ between two forms; how far one is behind another is the sum of its differences i
 claim follows is decided in `lab.inference`.
 """
 
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.discrepancy import Probabilities
-from optodrive.lab.discovery.fitting import Point, Simulation, fit, output_sizes, run_errors, weigh
+from optodrive.lab.discovery.fitting import Point, Simulation, run_errors, weigh
 from optodrive.lab.discovery.forms import CHANGE, CURVE, LINEAR, NAMELESS, Form
-from optodrive.lab.discovery.held_out import Split, sum_parts
+from optodrive.lab.discovery.held_out import WITHIN_NOISE, FreeRuns, Measured, Proposal, sum_parts
 from optodrive.lab.discovery.integration import STEP
 from optodrive.lab.discovery.memory import FILTERS, NONE, TEXTS, name_memory
 from optodrive.lab.discovery.model import Record
@@ -35,134 +34,20 @@ from optodrive.lab.inference.claim import (
     weigh_forms,
 )
 
-PARTS, EVIDENCE_PARTS = 64, 256
-"""Parts of a split's held-out samples in which forms are compared, and in which the evidence for a term is summed."""
-WITHIN_NOISE = 1.1
-"""Error in units of noise below which nothing is left to gain."""
+EVIDENCE_PARTS = 256
+"""Parts of a split's held-out samples in which the evidence for a term is summed."""
 SAME = 0.01
 """Squared difference of two functions, relative to the smaller one, below which they are one."""
 ALIKE_SIGMA, NEARLY = 2.0, 0.9
 """How far behind a simpler form may be, and which share of a curve's gain a formula of physics needs, to replace it."""
-UNCOMPUTABLE = (np.linalg.LinAlgError, ArithmeticError, ValueError)
-"""Errors of one candidate, which it alone is lost by."""
 NO_OFFSET = 0.1
 """Value of a term where its variable is nearest to zero, relative to its largest, below which it vanishes there."""
 PER_NUMBER, PER_CHANGE = 0.5, 0.1
 """Weight of a form beforehand, for each number that it has more than another, and for a change with time."""
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """A model fitted in each split.
-
-    points: [splits]; rmse: [splits, 2] in free run where fitted and held out; logs: [parts] of squared errors held out
-    in all splits; errors: [m, o] of each record, with the first split's numbers
-    """
-
-    points: tuple[Point, ...]
-    rmse: FloatArray
-    logs: FloatArray
-    errors: list[FloatArray]
-
-
-@dataclass(frozen=True, eq=False)
-class Proposal:
-    """A candidate with all numbers fitted by prediction errors, their squared sum, and the model in free run.
-
-    point: its last term is the proposed one
-    """
-
-    candidate: Candidate
-    point: Point
-    loss: float
-    measured: Measured | None = None
-
-    def evaluate(self, z: FloatArray) -> FloatArray:
-        """Return the values [n] of the proposed term at z [n]."""
-        point = self.point if self.measured is None else self.measured.points[0]
-        amplitude, first, second, _ = point.terms.values[-1].tolist()
-        return np.asarray(self.candidate.form.evaluate(z, first, second) * amplitude)
-
-
-class Judge:
-    """Comparison of models on held-out data. noise: [o] of the outputs."""
-
-    def __init__(
-        self, simulation: Simulation, records: Sequence[Record], splits: Sequence[Split], noise: FloatArray
-    ) -> None:
-        self.simulation, self.records, self.splits, self.noise = simulation, records, splits, noise
-        self.is_white = all(record.whiten is not None for record in records)
-        self.sizes = np.ones(len(noise)) if self.is_white else output_sizes(records)
-        self.floor = 1.0 if self.is_white else float(np.sqrt(np.mean((noise / self.sizes) ** 2)))
-
-    def fit(self, starts: Sequence[Point], masks: Sequence[BoolArray], evaluations: int = 12) -> Point:
-        """Return the best of some points, and of the fit of free runs from the first of them, in masked samples."""
-        weights = [np.outer(mask, 1.0 / self.sizes) for mask in masks]
-        fitted, _ = fit(self.simulation, self.records, starts[0], weights, evaluations=evaluations)
-        # Numbers that fit one step ahead need not fit free runs best; those of a chaotic system fit only the former.
-        return min((*starts, fitted), key=lambda each: _compute_rms(self.run(each), masks))
-
-    def run(self, point: Point) -> list[FloatArray]:
-        """Return the errors [m, o] of free runs of all records."""
-        return run_errors(self.simulation, self.records, point, self.sizes)
-
-    def measure(self, starts: Sequence[Sequence[Point]], max_rmse: float = np.inf) -> Measured:
-        """Return a model fitted in each split from some points of it, of which the first split's answer is one more.
-
-        Raises ValueError where the error of what the first split holds out is above max_rmse.
-        """
-        points, rmse, logs, first = list[Point](), list[list[float]](), list[FloatArray](), list[FloatArray]()
-        for split, own in zip(self.splits, starts, strict=True):
-            if rmse and rmse[0][1] > max_rmse:
-                raise ValueError(f"error {rmse[0][1]:.4g}: no rival of the best one")
-            # A memory's scale starts from a coarse grid.
-            evaluations = 24 if len(own[0].terms.memories) else 12
-            points.append(self.fit([*own, *points[:1]], split.fitted, evaluations))
-            errors = self.run(points[-1])
-            first = first or errors
-            rmse.append([_compute_rms(errors, split.fitted), _compute_rms(errors, split.held_out)])
-            sums = sum_parts([each**2 for each in errors], split.held_out, PARTS)
-            counts = sum_parts([np.ones(each.shape) for each in errors], split.held_out, PARTS)
-            logs.append(np.log(sums / counts + self.floor**2))
-        return Measured(tuple(points), np.array(rmse), np.concatenate(logs), first)
-
-    def measure_gains(self, base: Measured, before: Measured, after: Measured) -> tuple[SplitGain, ...]:
-        """Return the shares of the first model's avoidable error that a term removes, where there is any."""
-        shares = (np.minimum(before.rmse, base.rmse) - after.rmse) / np.maximum(
-            base.rmse - np.minimum(self.floor, after.rmse), 1e-12
-        )
-        is_quiet = np.maximum(before.rmse, after.rmse)[:, 1] <= WITHIN_NOISE * self.floor
-        return tuple(
-            SplitGain(split.name, *np.clip(share, -9.0, 1.0).tolist())
-            for split, share, quiet in zip(self.splits, shares, is_quiet, strict=True)
-            if not quiet
-        )
-
-    def measure_min_gain(self, base: Measured, before: Measured, after: Measured) -> float:
-        """Return the smallest gain in held-out data, 0 where there is nothing to gain."""
-        return min((each.held_out for each in self.measure_gains(base, before, after)), default=0.0)
-
-    def measure_rivals(
-        self,
-        base: Measured,
-        current: Measured,
-        rivals: Iterable[tuple[Proposal, Sequence[Sequence[Point]]]],
-        best: float,
-    ) -> list[Proposal]:
-        """Return proposals measured from starts in every split, without those that cannot be rivals of the best.
-
-        best: smallest held-out gain of another one
-        """
-        found = list[Proposal]()
-        before, first = min(current.rmse[0, 1], base.rmse[0, 1]), base.rmse[0, 1]
-        for each, starts in rivals:
-            with suppress(*UNCOMPUTABLE):
-                # What gains less than this share of another's gain in one split is no rival of it.
-                enough = max(before - MIN_KEPT * best * (first - self.floor), WITHIN_NOISE * self.floor)
-                measured = self.measure(starts, enough if best > 0.0 else np.inf)
-                best = max(best, self.measure_min_gain(base, current, measured))
-                found.append(replace(each, measured=measured))
-        return found
+class Judge(FreeRuns):
+    """Comparison of models on held-out data."""
 
     def compute_evidence(
         self, before: Sequence[FloatArray], after: Sequence[FloatArray], masks: Sequence[BoolArray], tries: int
@@ -194,9 +79,51 @@ class Judge:
 
         filtered: the search's records; start: the model without the term there, None where it is known to be missing
         """
+        kept = self._list_distinct(before, proposals)
+        gains = [self.measure_gains(base, before, measured) for _, measured in kept]
+        forms = self._weigh(kept, gains)
+        is_usable = [form.gain > 0.0 and len(own) > 0 for form, own in zip(forms, gains, strict=True)]
+        # Time explains any slow misfit: it is what is left where no state and no input extrapolates. A curve beside a
+        # term follows what that one leaves.
+        last = (CHANGE, CURVE) if len(before.points[0].terms) else (CHANGE,)
+        ranked = sorted(range(len(kept)), key=lambda k: -forms[k].probability)
+        chosen = min(ranked, key=lambda k: (not is_usable[k], forms[k].kind in last))
+        no_effect, tries = 0.0, 2 * len(kept)  # in predictions that follow the data, and in free runs
+        if start is not None:
+            no_effect = self._compute_step_evidence(filtered, start, kept[chosen][0].point, tries)
+        without, with_term = self._remove_nuisances(before, (before.errors, kept[chosen][1].errors))
+        no_effect = min(no_effect, self.compute_evidence(without, with_term, self.splits[0].held_out, tries))
+        names = {k: (f"{forms[k].name} ({forms[k].formula})",) for k in ranked}
+        probabilities = Probabilities(
+            no_effect, 0.0, {names[k]: (1.0 - no_effect) * forms[k].probability for k in ranked}
+        )
+        # A term has no other forms of its own, and is a name only beside terms that explain half of all together.
+        alternatives = [
+            Alternative(
+                names[k],
+                (self.measure_min_gain(base, base, kept[k][1]), 1.0),
+                gains=gains[k],
+                nameless=NAMELESS.get(forms[k].kind, ""),
+            )
+            for k in ranked
+        ]
+        twins = {names[k][0]: twin for k in ranked if (twin := self._find_twin(filtered, kept[k][0]))}
+        found = TermClaim(
+            claim(Evidence(probabilities, tuple(alternatives), twins)),
+            1.0 - no_effect,
+            tuple(forms[k] for k in ranked),
+            forms[chosen],
+            gains[chosen],
+        )
+        if found.claim.verdict not in ("cause", "none", "undecided"):
+            rival = next((k for k in ranked if k != chosen and forms[k].probability >= MIN_LISTED), None)
+            found = replace(found, next_record=self._propose_record(kept, forms, chosen, rival, gains[chosen]))
+        return kept[chosen][0], found
+
+    def _list_distinct(self, before: Measured, proposals: Sequence[Proposal]) -> list[tuple[Proposal, Measured]]:
+        """Return the fitted proposals, of those alike the simplest, which comes first."""
+        kept, named = list[tuple[Proposal, Measured]](), dict[str, tuple[Proposal, Measured]]()
         fitted = [(each, each.measured) for each in proposals if each.measured is not None]
-        kept = list[tuple[Proposal, Measured]]()
-        named = dict[str, tuple[Proposal, Measured]]()
         for each, measured in sorted(fitted, key=lambda item: -float(item[1].logs.mean())):
             named[self.name(each).name] = each, measured  # of one name the best, which is the last
         # Curves come last: one is as good as a formula of physics nearly everywhere. Before them come memories, for
@@ -214,8 +141,11 @@ class Judge:
         ):
             if not any(_stands_for((one, other), (each, measured), before) for one, other in kept):
                 kept.append((each, measured))
+        return kept
+
+    def _weigh(self, kept: Sequence[tuple[Proposal, Measured]], gains: Sequence[Sequence[SplitGain]]) -> list[TermForm]:
+        """Return the forms with their probabilities among each other and their smallest gains."""
         forms = [self.name(each) for each, _ in kept]
-        gains = [self.measure_gains(base, before, measured) for _, measured in kept]
         minimum = [min((each.held_out for each in own), default=0.0) for own in gains]
         # What gains less than half of another one where it was not fitted is no rival of it, and a curve none of a
         # formula of physics that gains nearly as much.
@@ -229,41 +159,11 @@ class Judge:
         ]
         rivals = [measured for (_, measured), weight in zip(kept, prior, strict=True) if weight > 0.0]
         best = min(rivals, key=lambda each: float(each.logs.mean()))
-        weights = weigh_forms([_is_behind(measured, best) for _, measured in kept], prior)
-        forms = [
+        weights = weigh_forms([_compute_behind(measured, best) for _, measured in kept], prior)
+        return [
             replace(form, probability=weight, gain=gain)
             for form, weight, gain in zip(forms, weights, minimum, strict=True)
         ]
-        # A term has no other forms of its own, and is a name only beside terms that explain half of all together.
-        explained = [(self.measure_min_gain(base, base, measured), 1.0) for _, measured in kept]
-        is_usable = [form.gain > 0.0 and len(own) > 0 for form, own in zip(forms, gains, strict=True)]
-        # Time explains any slow misfit: it is what is left where no state and no input extrapolates.
-        order = sorted(range(len(kept)), key=lambda k: (not is_usable[k], forms[k].kind == CHANGE, -weights[k]))
-        chosen = order[0]
-        no_effect, tries = 0.0, 2 * len(kept)  # in predictions that follow the data, and in free runs
-        if start is not None:
-            no_effect = self._compute_step_evidence(filtered, start, kept[chosen][0].point, tries)
-        without, with_term = self._remove_nuisances(before, (before.errors, kept[chosen][1].errors))
-        no_effect = min(no_effect, self.compute_evidence(without, with_term, self.splits[0].held_out, tries))
-        names = {k: (f"{forms[k].name} ({forms[k].formula})",) for k in order}
-        probabilities = Probabilities(no_effect, 0.0, {names[k]: (1.0 - no_effect) * weights[k] for k in order})
-        ranked = sorted(order, key=lambda k: -weights[k])
-        alternatives = [
-            Alternative(names[k], explained[k], gains=gains[k], nameless=NAMELESS.get(forms[k].kind, ""))
-            for k in ranked
-        ]
-        twins = {names[k][0]: twin for k in ranked if (twin := self._find_twin(filtered, kept[k][0]))}
-        found = TermClaim(
-            claim(Evidence(probabilities, tuple(alternatives), twins)),
-            1.0 - no_effect,
-            tuple(forms[k] for k in ranked),
-            forms[chosen],
-            gains[chosen],
-        )
-        if found.claim.verdict not in ("cause", "none", "undecided"):
-            rival = next((k for k in ranked if k != chosen and weights[k] >= MIN_LISTED), None)
-            found = replace(found, next_record=self._propose_record(kept, forms, chosen, rival, gains[chosen]))
-        return kept[chosen][0], found
 
     def _compute_step_evidence(self, filtered: Sequence[Filtered], start: Point, longer: Point, tries: int) -> float:
         """Return the probability of no effect from predictions that follow the data, where held out."""
@@ -369,13 +269,6 @@ def _scale(record: Record, factor: float) -> Record:
     return replace(record, inputs=record.inputs * factor, outputs=record.outputs * factor)
 
 
-def _compute_rms(errors: Sequence[FloatArray], masks: Sequence[BoolArray]) -> float:
-    """Return the root mean square of errors [m, o] of each record over masked samples [m]."""
-    squares = sum(float(np.sum(each[mask] ** 2)) for each, mask in zip(errors, masks, strict=True))
-    count = sum(int(np.count_nonzero(each[mask])) for each, mask in zip(errors, masks, strict=True))
-    return float(np.sqrt(squares / max(count, 1)))
-
-
 def _has_offset(proposal: Proposal) -> bool:
     """Return whether a term is not near zero where its variable is nearest to it, as after an offset."""
     values = np.abs(proposal.evaluate(proposal.candidate.screened.nodes))
@@ -394,37 +287,38 @@ def _stands_for(simple: tuple[Proposal, Measured], other: tuple[Proposal, Measur
     is_constant = one.candidate.is_constant
     is_rewritten = at.variable == further.variable and one.candidate.numbers == two.candidate.numbers
     if is_constant or is_rewritten or one.candidate.numbers < two.candidate.numbers:
-        # The same predictions, whichever variables they are functions of.
+        # The same predictions, whichever variables they are functions of, as good as the other's.
         apart, changes = _sum_squares(a, b), (_sum_squares(a, before), _sum_squares(b, before))
-        if apart <= SAME * min(changes):
+        if apart <= SAME * min(changes) and (a.rmse <= WITHIN_NOISE * b.rmse).all():
             return True
     is_special = (
         # Each form of a variable becomes a constant or a line beyond the data.
         is_constant
         or (at == further and one.candidate.form.kind == LINEAR.kind)
         or (further.memory != NONE and at.memory == NONE)
-        or _is_same(one, two)
+        or (at.key == further.key and two.candidate.form.kind == CURVE)
+        or is_same(one, two)
     )
-    return is_special and _is_behind(a, b) < ALIKE_SIGMA
+    return is_special and _compute_behind(a, b) < ALIKE_SIGMA
 
 
 def _sum_squares(one: Measured, other: Measured) -> float:
     return sum(float(np.sum((a - b) ** 2)) for a, b in zip(one.errors, other.errors, strict=True))
 
 
-def _is_same(one: Proposal, other: Proposal) -> bool:
-    """Return whether two terms are one function along the data. A curve may be any."""
+def is_same(one: Proposal, other: Proposal, share: float = SAME) -> bool:
+    """Return whether two terms are one function along the data, neither a curve, which may be any."""
     screened = one.candidate.screened
     if screened.at.key != other.candidate.screened.at.key:
         return False
-    if other.candidate.form.kind == CURVE:
-        return True
+    if CURVE in (one.candidate.form.kind, other.candidate.form.kind):
+        return False
     a, b = one.evaluate(screened.nodes), other.evaluate(screened.nodes)
     apart = float((a - b) @ screened.full @ (a - b))
-    return apart <= SAME * min(float(a @ screened.full @ a), float(b @ screened.full @ b))
+    return apart <= share * min(float(a @ screened.full @ a), float(b @ screened.full @ b))
 
 
-def _is_behind(one: Measured, best: Measured) -> float:
+def _compute_behind(one: Measured, best: Measured) -> float:
     """Return by how many σ one model predicts worse than another."""
     apart = one.logs - best.logs
     return sum_in_sigma(apart, apart - apart.mean())[0] if np.abs(apart).max() > 1e-9 else 0.0

@@ -7,8 +7,7 @@ from optodrive.client.fingers import read_finger_script
 from optodrive.core.errors import InputError
 from optodrive.core.numeric_tables import escape_formula, open_table, read_columns
 from optodrive.lab.calibration.pictures import SpotsSection, _list_by_table
-from optodrive.lab.discovery.input_files import read_record
-from optodrive.lab.discovery.model import OdeModel, Parameter
+from optodrive.lab.discovery.model import OdeModel, Parameter, read_record
 from optodrive.lab.recording.csv_folder import CsvTree
 
 
