@@ -99,6 +99,7 @@ class PlanQueue:
         if state is self.state:
             return
         before = {plan.plan_id: plan.record for plan in self.state.plans}
+        # First, so that what ends a plan, and any reader in another thread, finds the queue without it.
         self.state = replace(state, ended=())
         for plan in (*(end.plan for end in state.ended), *state.plans):
             known = before.get(plan.plan_id)
@@ -106,6 +107,7 @@ class PlanQueue:
                 self.accounts.count(known, plan.record)
                 self._plan_store.publish(plan.record)
         for plan, job in state.running:
+            # Link streams by the zero of the job, which follows that of its plan.
             delay_s = plan.record.start_s - before.get(plan.plan_id, plan.record).start_s
             if delay_s:
                 job.delay(round(delay_s / self._session.tick_s))
