@@ -118,7 +118,10 @@ class LaserSection(Section):
     max_power_w: Annotated[Positive, PlausibleRange(1e-3, 60.0, "W")]
     """Incident power at the sample at full duty, W."""
     pwm_hz: Annotated[Positive, PlausibleRange(50.0, 1e7, "Hz")]
-    """Frequency of the pulse-width modulation, Hz; pulses are whole periods wide."""
+    """Frequency of the pulse-width modulation, Hz; pulses below full power are whole periods wide."""
+    whole_periods: bool = True
+    """Whether pulses at full power are whole periods wide, too, and not only whole microseconds, as a module that
+    modulates by itself needs."""
     threshold_w: Annotated[float, Field(ge=0), PlausibleRange(0.0, 10.0, "W")] = 0.0
     """Incident power below which the module emits nothing, W, 0 if it has no threshold. Pulses below it are counted."""
     focus_width_m: FocusSide

@@ -191,11 +191,17 @@ class ExtendedThermalState:
         drive: DriveRange,
         min_periods: int = 1,
         peak_after_s: float = 0.0,
-    ) -> tuple[int, float] | None:
+    ) -> tuple[float, float] | None:
         """See `ThermalState.solve_pulse`."""
         context, work, off_s = self._advance_copy(pixel, start_s)
         on_states = np.zeros((drive.max_periods + 1, STATE_COUNT))
-        span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
+        span = (
+            drive.max_power_w,
+            drive.period_s,
+            min(min_periods, drive.max_periods),
+            drive.max_periods,
+            drive.is_fine,
+        )
         one = self.pixels.elements[pixel]
         periods, duty = find_shortest_pulse(
             one, self._active, context, pixel, work, on_states, off_s, target_m, *span, peak_after_s

@@ -5,6 +5,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.extended_pulses import advance_states, copy_states, peak_after_off_m, set_light
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms
+from optodrive.physics.pulse_for_height import round_us
 from optodrive.physics.term import POWER_W
 
 PEAK_TOLERANCE = 1e-5
@@ -40,8 +41,9 @@ def find_shortest_pulse(
     period_s: float,
     min_periods: int,
     max_periods: int,
+    is_fine: bool,
     peak_after_s: float,
-) -> tuple[int, float]:
+) -> tuple[float, float]:
     """Solve as `ExtendedThermalState.solve_pulse`, from the states work[0]. Return 0 periods if no pulse is needed.
 
     Until the pulse the light is where the context says, then on this pixel, `index`.
@@ -49,7 +51,7 @@ def find_shortest_pulse(
     """
     copy_states(work[0], on_states[0])
     if _peak_after_state_m(pixel, active, c, work, on_states[0], off_s, peak_after_s) >= target_m:
-        return 0, 0.0
+        return 0.0, 0.0
     set_light(c, index, index)
     high, highest_m = max_periods, 0.0
     copy_states(on_states[0], work[0])
@@ -70,11 +72,18 @@ def find_shortest_pulse(
             high = middle
         else:
             low = middle
-    return high, _solve_duty(pixel, active, c, work, on_states[0], target_m, max_power_w, high * period_s, peak_after_s)
+    if is_fine and high > min_periods:
+        widths_s = (low * period_s, high * period_s)
+        share = _solve_share(pixel, active, c, work, on_states[0], target_m, max_power_w, *widths_s, peak_after_s)
+        return 1e-6 * round_us(widths_s[0] + share * period_s) / period_s, 1.0
+    width_s = high * period_s
+    return float(high), _solve_share(
+        pixel, active, c, work, on_states[0], target_m, max_power_w, width_s, width_s, peak_after_s
+    )
 
 
 @kernel
-def _solve_duty(
+def _solve_share(
     pixel: Pixel,
     active: ActiveTerms,
     c: FloatArray,
@@ -82,15 +91,21 @@ def _solve_duty(
     state: FloatArray,
     target_m: float,
     max_power_w: float,
+    min_width_s: float,
     width_s: float,
     peak_after_s: float,
 ) -> float:
     """Return the duty at which a pulse's peak is target_m, by the Illinois method, or 1 if none is.
 
     0 if what the laser still emits after its last pulse reaches the target as soon as the light is on the pixel.
+    For a min_width_s below width_s, return the share of the way between these at which full power does it.
     """
     low, high = 0.0, 1.0
-    low_error_m = _peak_after_state_m(pixel, active, c, work, state, 0.0, peak_after_s) - target_m
+    is_by_width = min_width_s < width_s
+    if is_by_width:
+        low_error_m = _pulse_peak_m(pixel, active, c, work, state, max_power_w, min_width_s, peak_after_s) - target_m
+    else:
+        low_error_m = _peak_after_state_m(pixel, active, c, work, state, 0.0, peak_after_s) - target_m
     high_error_m = _pulse_peak_m(pixel, active, c, work, state, max_power_w, width_s, peak_after_s) - target_m
     if high_error_m <= 0.0:
         return 1.0
@@ -98,17 +113,19 @@ def _solve_duty(
         return 0.0
     retained_side = 0
     for _ in range(30):
-        duty = (low * high_error_m - high * low_error_m) / (high_error_m - low_error_m)
-        error_m = _pulse_peak_m(pixel, active, c, work, state, duty * max_power_w, width_s, peak_after_s) - target_m
+        share = (low * high_error_m - high * low_error_m) / (high_error_m - low_error_m)
+        power_w = max_power_w if is_by_width else share * max_power_w
+        until_s = min_width_s + share * (width_s - min_width_s)
+        error_m = _pulse_peak_m(pixel, active, c, work, state, power_w, until_s, peak_after_s) - target_m
         if abs(error_m) <= PEAK_TOLERANCE * target_m:
-            return duty
+            return share
         if error_m > 0.0:
-            high, high_error_m = duty, error_m
+            high, high_error_m = share, error_m
             # Illinois: the end that stays twice counts half, or false position would creep from one side.
             low_error_m *= 0.5 if retained_side > 0 else 1.0
             retained_side = 1
         else:
-            low, low_error_m = duty, error_m
+            low, low_error_m = share, error_m
             high_error_m *= 0.5 if retained_side < 0 else 1.0
             retained_side = -1
     # The end above the target: a pulse rather reaches too much than too little.

@@ -129,13 +129,22 @@ class NominalThermalState:
         drive: DriveRange,
         min_periods: int = 1,
         peak_after_s: float = 0.0,
-    ) -> tuple[int, float] | None:
+    ) -> tuple[float, float] | None:
         """See `ThermalState.solve_pulse`."""
         if not 0 <= pixel < len(self._at_s):
             raise IndexError(f"pixel {pixel} of {len(self._at_s)}")
-        span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
+        longest = drive.max_periods
         periods, duty = solve_pulse_at(
-            *self.kernel_state, pixel, float(start_s), float(target_m), *span, float(peak_after_s)
+            *self.kernel_state,
+            pixel,
+            float(start_s),
+            float(target_m),
+            drive.max_power_w,
+            drive.period_s,
+            min(min_periods, longest),
+            longest,
+            drive.is_fine,
+            float(peak_after_s),
         )
         if periods < 0:
             raise self.build_time_order_error(pixel, start_s)
@@ -273,8 +282,9 @@ def solve_pulse_at(
     period_s: float,
     min_periods: int,
     max_periods: int,
+    is_fine: bool,
     peak_after_s: float,
-) -> tuple[int, float]:
+) -> tuple[float, float]:
     """Solve as `solve_pulse`.
 
     Returns 0 periods if no pulse is needed, -1 if start_s is before the pixel's last event.
@@ -282,12 +292,12 @@ def solve_pulse_at(
     """
     one, off_s = pixel_at(columns, i), start_s - last_s[i]
     if off_s < -TIME_ROUNDING_S:
-        return -1, 0.0
+        return -1.0, 0.0
     absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, off_s))
     # A dead pixel has κ = 0 and gets an infinite target: no pulse reaches it, and none is asked to.
     target_k = target_m / one.kappa_m_per_k
     return find_shortest_pulse(
-        one, absorber_k, gas_k, target_k, max_power_w, period_s, min_periods, max_periods, peak_after_s
+        one, absorber_k, gas_k, target_k, max_power_w, period_s, min_periods, max_periods, is_fine, peak_after_s
     )
 
 

@@ -1,6 +1,8 @@
-"""Pulse that reaches a target displacement on the nominal pixel: the fewest whole PWM periods, fine-tuned by duty."""
+"""Pulse that reaches a target displacement on the nominal pixel: the fewest PWM periods, tuned by duty or width."""
 
 from dataclasses import dataclass
+
+import numpy as np
 
 from optodrive.core.kernels import kernel
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
@@ -8,17 +10,24 @@ from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
 @dataclass(frozen=True)
 class DriveRange:
-    """Range of one pulse: full power, the PWM period of which its width is a multiple, and the largest multiple."""
+    """Range of one pulse: full power, the PWM period of which its width is a multiple, and the largest multiple.
+
+    is_fine: pulses at full power that are longer than a period have any whole number of microseconds. The PWM does not
+    switch at full power, so such a pulse has no phase.
+    """
 
     max_power_w: float
     period_s: float
     max_periods: int
+    is_fine: bool = False
 
     @classmethod
-    def from_laser(cls, max_power_w: float, pwm_hz: float, width_max_s: float) -> "DriveRange":
+    def from_laser(
+        cls, max_power_w: float, pwm_hz: float, width_max_s: float, *, is_fine: bool = False
+    ) -> "DriveRange":
         """Return the range for a laser's power, W, and PWM frequency, Hz, and the longest pulse allowed, s."""
         # A width cap of whole periods must not lose one to rounding.
-        return cls(max_power_w, 1.0 / pwm_hz, int(width_max_s * pwm_hz + 1e-9))
+        return cls(max_power_w, 1.0 / pwm_hz, int(width_max_s * pwm_hz + 1e-9), is_fine)
 
 
 @kernel
@@ -62,16 +71,17 @@ def find_shortest_pulse(
     period_s: float,
     min_periods: int,
     max_periods: int,
+    is_fine: bool,
     peak_after_s: float,
-) -> tuple[int, float]:
+) -> tuple[float, float]:
     """Return PWM periods and duty of the shortest pulse whose peak gas rise is target_k, from the residual rises.
 
-    The pulse has min_periods to max_periods. peak_after_s: the peak counts only from this time after the pulse's start,
-    and not before its end. Returns 0 periods if the residual heat already reaches the target, and the longest pulse if
-    none reaches it.
+    The pulse has min_periods to max_periods, whole ones unless `DriveRange.is_fine`. peak_after_s: the peak counts only
+    from this time after the pulse's start, and not before its end. Returns 0 periods if the residual heat already
+    reaches the target, and the longest pulse if none reaches it.
     """
     if _peak_after(pixel, theta_k, gamma_k, 0.0, 0.0, peak_after_s)[0] >= target_k:
-        return 0, 0.0
+        return 0.0, 0.0
     # Bisection over whole periods at full power: a wider pulse always peaks higher.
     low, high = min_periods - 1, max_periods
     while high - low > 1:
@@ -80,8 +90,25 @@ def find_shortest_pulse(
             high = middle
         else:
             low = middle
+    if is_fine and high > min_periods:
+        low_us, high_us = int(1e6 * low * period_s), round_us(high * period_s)
+        while high_us - low_us > 1:
+            middle_us = (low_us + high_us) // 2
+            if _peak_after(pixel, theta_k, gamma_k, max_power_w, middle_us * 1e-6, peak_after_s)[0] >= target_k:
+                high_us = middle_us
+            else:
+                low_us = middle_us
+        low_k = _peak_after(pixel, theta_k, gamma_k, max_power_w, low_us * 1e-6, peak_after_s)[0]
+        high_k = _peak_after(pixel, theta_k, gamma_k, max_power_w, high_us * 1e-6, peak_after_s)[0]
+        return 1e-6 * (low_us if target_k - low_k < high_k - target_k else high_us) / period_s, 1.0
     duty = _solve_duty(pixel, theta_k, gamma_k, target_k, high * period_s, max_power_w, peak_after_s)
-    return (high, duty) if duty > MIN_DUTY else (0, 0.0)
+    return (float(high), duty) if duty > MIN_DUTY else (0.0, 0.0)
+
+
+@kernel
+def round_us(width_s: float) -> int:
+    """Return a width in whole microseconds."""
+    return int(np.rint(width_s * 1e6))
 
 
 @kernel

@@ -42,8 +42,10 @@ class ThermalState(Protocol):
         drive: DriveRange,
         min_periods: int = 1,
         peak_after_s: float = 0.0,
-    ) -> tuple[int, float] | None:
+    ) -> tuple[float, float] | None:
         """Return PWM periods and duty of the shortest pulse at start_s whose peak displacement is target_m.
+
+        The periods are whole ones, unless the drive is fine and the duty is 1.
 
         Returns None if the residual heat already reaches the target, and the longest pulse if none reaches it. The
         pulse has at least min_periods, within the drive's range. peak_after_s: the peak counts only from this time

@@ -68,7 +68,8 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
     caps = caps._replace(absorber_k=caps.absorber_k - late_k)
     galvos = [build_galvo_model(stage) for stage in stages]
     check_galvo_cap(limits.galvo_acceleration_rms_max_rad_per_s2, galvos)
-    return Budget(caps, heat, GalvoModels.from_models(*galvos))
+    pwm_period_s = np.array([1.0 / stage.laser.pwm_hz for stage in stages])
+    return Budget(caps, heat, GalvoModels.from_models(*galvos), pwm_period_s)
 
 
 def compute_fastest_rise_k_per_s(heat: HeatBound, caps: CapValues) -> float:

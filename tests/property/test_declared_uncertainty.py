@@ -57,7 +57,7 @@ SCENARIOS = {
 def limit_scenario(scenario, **half_widths):
     caps, rows = SCENARIOS[scenario]
     unsure, caps = Uncertainty(**dict.fromkeys(HALF_WIDTHS, 0.0) | half_widths), NO_CAPS._replace(**caps)
-    budget = Budget(caps, build_heat_bound(MODEL, unsure, caps, FULL_W), MIRRORS)
+    budget = Budget(caps, build_heat_bound(MODEL, unsure, caps, FULL_W), MIRRORS, np.full(1, 2e-4))
     return limit(build_plan(rows, FULL_W, SECTION), build_cold_budget_state(4), budget)[0]
 
 

@@ -53,7 +53,7 @@ def build_budget(name):
     model, cap_k, _ = CASES[name]
     caps = NO_CAPS._replace(wall_k=cap_k)
     heat = build_heat_bound(model, CERTAIN, caps, *[FULL_W] * STAGES)
-    return Budget(caps, heat, GalvoModels.from_models(*[FAST_MIRRORS] * STAGES))
+    return Budget(caps, heat, GalvoModels.from_models(*[FAST_MIRRORS] * STAGES), np.full(STAGES, 1e-6))
 
 
 def build_drive(name):

@@ -8,6 +8,7 @@ import pytest
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.daemon.engine import page_refresh
 from optodrive.link.session import staged_job
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.stimuli import standing_page
 from standing_rig import StandingRig, build_display, build_page, compute_plan_light_j
 
@@ -120,3 +121,18 @@ def test_delays_that_are_no_delays_end_the_link(monkeypatch):
     monkeypatch.setattr(staged_job, "find_begin_tick", lambda on_tick, *_: on_tick)
     with pytest.raises((AssertionError, ValueError)):
         check(monkeypatch, "display_0.2_w", 40, 150.0, 0.1, 0)
+
+
+def test_gates_in_microseconds_reach_the_board(monkeypatch):
+    config = SHIPPED.config
+    laser = config.laser.model_copy(update={"whole_periods": False})
+    display = DisplayModel.from_config(config.model_copy(update={"laser": laser}))
+    rig = begin(monkeypatch, display)
+    page_m, since_s = build_page(display, choose_pixels(40), 50.0), rig.clock.now_s()
+    rig.stand(page_m, 1.0)
+    assert rig.compute_light_j(since_s) >= SHARE_MIN * compute_plan_light_j(display, page_m, 1.0)
+    assert not rig.list_events("fault")
+    on_us, off_us, duty = rig.list_pulses(since_s).T
+    is_whole = (off_us - on_us) % 200 == 0
+    assert np.mean(is_whole) < 0.5
+    assert (duty[~is_whole] == 65535).all()

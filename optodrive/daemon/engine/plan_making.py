@@ -141,7 +141,9 @@ def dim_display(display: DisplayModel, share: float) -> DisplayModel:
     caps = display.budget.caps
     if share >= caps.power_share:
         return display
-    return replace(display, budget=display.budget._replace(caps=caps._replace(power_share=share)))
+    scan_heads = tuple(replace(each, drive=replace(each.drive, is_fine=False)) for each in display.scan_heads)
+    budget = display.budget._replace(caps=caps._replace(power_share=share))
+    return replace(display, scan_heads=scan_heads, budget=budget)
 
 
 class Dimmer:

@@ -147,8 +147,12 @@ def select_galvo(galvos: GalvoModels, stage: int) -> GalvoModel:
 
 
 class Budget(NamedTuple):
-    """All coefficients that the limiter needs."""
+    """All coefficients that the limiter needs.
+
+    pwm_period_s: [k] period of each stage's laser
+    """
 
     caps: CapValues
     heat: HeatBound
     galvos: GalvoModels
+    pwm_period_s: FloatArray

@@ -75,6 +75,8 @@ class TimedPulses(Protocol):
 MAX_WAIT_S = 3600.0
 """A plan that does not fit after this time with the gate off never fits."""
 WAIT_RESOLUTION_S = 1e-3
+TICK_ROUNDING_S = 1e-6
+"""Difference from whole PWM periods that rounding to a microsecond makes."""
 
 
 def build_cold_budget_state(pixel_count: int, at_s: float = 0.0, stage_count: int = 1) -> BudgetState:
@@ -133,6 +135,9 @@ def limit(
 ) -> tuple[LimitedPlan, BudgetState]:
     """Reduce the power of each pulse until it is within all caps. Times and widths do not change.
 
+    The PWM shows in a pulse below full power. Where its last period is not whole, the part that is on may be more than
+    its share, and the power is reduced by as much.
+
     plan.start_s and state.at_s are on the same time line. Returns the limited plan and the state after it.
 
     Raises OverBudgetError under every policy except "trim" if a pulse would be trimmed. Raises RefusedError under every
@@ -144,6 +149,7 @@ def limit(
     )
     if applied < len(plan):
         raise _build_refusal(plan, applied, float(power_w[applied]), REASONS[cause[applied]], state, budget)
+    power_w = np.where(power_w < plan.power_w, _allow_for_split_period(plan, power_w, budget), power_w)
     columns = {item.name: getattr(plan, item.name) for item in fields(PulsePlan)}
     columns["power_w"] = power_w
     limited = LimitedPlan(
@@ -155,6 +161,21 @@ def limit(
         headroom_k=budget.caps.absorber_k - np.maximum(workspace.budgets.peak_k, state.rise_k),
     )
     return limited, close_workspace(workspace, budget)
+
+
+def _allow_for_split_period(plan: PulsePlan, power_w: FloatArray, budget: Budget) -> FloatArray:
+    """Return the powers, [n], W, at which a laser with a PWM, which begins with the pulse, emits the mean of `power_w`.
+
+    Of a last period that is not whole, the part that is on comes first.
+    """
+    period_s, full_w = budget.pwm_period_s[plan.stage], budget.heat.power_max_w[plan.stage]
+    periods = plan.width_s / period_s
+    is_split = np.abs(periods - np.rint(periods)) * period_s > TICK_ROUNDING_S
+    whole, on_periods = np.floor(periods), periods * power_w / full_w
+    duty = on_periods / (whole + 1.0)
+    is_on_to_the_end = duty > periods - whole
+    duty = np.where(is_on_to_the_end, (on_periods - (periods - whole)) / np.maximum(whole, 1.0), duty)
+    return np.where(is_split, np.minimum(duty * full_w, power_w), power_w)
 
 
 def compute_wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float:

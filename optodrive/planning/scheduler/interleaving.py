@@ -50,7 +50,7 @@ class CandidateSchedule:
     has_min_gaps: bool
 
 
-def split_pulses(single_pulses: Mapping[int, tuple[int, float]], rounds: int) -> PeriodsByPixel | None:
+def split_pulses(single_pulses: Mapping[int, tuple[float, float]], rounds: int) -> PeriodsByPixel | None:
     """Compute each pixel's sub-pulse width at full power. Return None if a pulse is too short to be split.
 
     single_pulses: by pixel, width in PWM periods and duty of the single pulse that reaches the target

@@ -12,7 +12,7 @@ from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.settling import CEIL_OFFSET
 from optodrive.physics.nominal_display import NominalThermalState, solve_pulse_at
-from optodrive.physics.pulse_for_height import DriveRange
+from optodrive.physics.pulse_for_height import DriveRange, round_us
 from optodrive.planning.scheduler.batch_draft import BatchDraft, PlannedPulse
 from optodrive.planning.scheduler.scan_head import MoveTimes
 
@@ -34,21 +34,22 @@ class DriveSpan(NamedTuple):
     max_power_w: float
     period_s: float
     max_periods: int
+    is_fine: bool
 
 
 class RoundPulses(NamedTuple):
-    """Columns of the pulses [n] of a round, filled in by the kernel. periods: 0 for a pixel that needs no pulse."""
+    """Columns of the pulses [n] of a round, filled in by the kernel. width_us: 0 for a pixel that needs no pulse."""
 
     start_us: IntArray
     settling_us: IntArray
-    periods: IntArray
+    width_us: IntArray
     duty: FloatArray
 
     @classmethod
     def empty(cls, count: int) -> "RoundPulses":
         """Return columns of `count` pulses."""
-        start_us, settling_us, periods = np.zeros((3, count), dtype=np.int64)
-        return cls(start_us, settling_us, periods, np.zeros(count))
+        start_us, settling_us, width_us = np.zeros((3, count), dtype=np.int64)
+        return cls(start_us, settling_us, width_us, np.zeros(count))
 
 
 def draft_round(
@@ -71,7 +72,7 @@ def draft_round(
     """
     beam, pulses = draft.state.beams[stage], RoundPulses.empty(len(pixel))
     start = KernelBeam(beam.free_us, NO_PIXEL if beam.pixel is None else beam.pixel, beam.arrival_us, beam.dwell_us)
-    span = DriveSpan(drive.max_power_w, drive.period_s, drive.max_periods)
+    span = DriveSpan(drive.max_power_w, drive.period_s, drive.max_periods, drive.is_fine)
     count = len(pixel) if max_count is None else max_count
     visited, *after = _solve_round(
         *heat.kernel_state, draft.paths[stage].moves, pixel, target_m, earliest_us, until_us, start, span, count, pulses
@@ -82,12 +83,12 @@ def draft_round(
     beam.position += visited
     beam.free_us, last_pixel, beam.arrival_us, beam.dwell_us = after
     beam.pixel = None if last_pixel == NO_PIXEL else last_pixel
-    for skipped in np.flatnonzero(pulses.periods[:visited] == 0):
+    for skipped in np.flatnonzero(pulses.width_us[:visited] == 0):
         draft.skip(source, int(pixel[skipped]), float(target_m[skipped]))
-    drawn = np.flatnonzero(pulses.periods[:visited])
+    drawn = np.flatnonzero(pulses.width_us[:visited])
     columns = (
         pulses.start_us[drawn],
-        np.rint(pulses.periods[drawn] * drive.period_s * 1e6).astype(np.int64),
+        pulses.width_us[drawn],
         pulses.duty[drawn] * drive.max_power_w,
         pixel[drawn],
         pulses.settling_us[drawn],
@@ -137,18 +138,20 @@ def _solve_round(
             drive.period_s,
             1,
             drive.max_periods,
+            drive.is_fine,
             0.0,
         )
         pulses.start_us[row], pulses.settling_us[row] = start_us, settling_us
-        pulses.periods[row], pulses.duty[row] = periods, duty
-        if periods < 0:
+        width_us = round_us(periods * drive.period_s)
+        pulses.width_us[row], pulses.duty[row] = width_us, duty
+        if periods < 0.0:
             # A kernel raises no error with numbers in it; the caller does.
             return -1 - row, free_us, origin, arrival_us, dwell_us
         # A skipped pixel is not visited: the beam goes on from where it stands.
-        if periods:
+        if width_us:
             if i != origin:
                 arrival_us = start_us
-            free_us, origin = start_us + int(np.rint(periods * drive.period_s * 1e6)), i
+            free_us, origin = start_us + width_us, i
             dwell_us = free_us - arrival_us
             rows += 1
         row += 1

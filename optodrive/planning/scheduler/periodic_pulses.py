@@ -47,7 +47,7 @@ BISECTIONS = 8
 """Bisections of the lead period's relative duty."""
 MIN_REFERENCE_S = 1e-9
 """Smallest time after a pulse's start at which its displacement is taken."""
-Shape = tuple[int, float]
+Shape = tuple[float, float]
 """Width in PWM periods and duty of a pulse."""
 
 
@@ -75,7 +75,7 @@ class PeriodicSteadyState:
     reference_m, reference_s: displacement at a time after the pulse's start at which it depends on this pulse's energy
     """
 
-    periods: int
+    periods: float
     duty: float
     lead_duty: float
     peak_m: float
@@ -195,7 +195,7 @@ def _foresee_deviation(
 
 
 def compute_steady_state(
-    train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, duty: float, lead_duty: float = 0.0
+    train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: float, duty: float, lead_duty: float = 0.0
 ) -> PeriodicSteadyState:
     """Simulate the steady state of identical pulses in every cycle.
 
@@ -315,7 +315,7 @@ def _find_peak_to_peak_shape(
 
 
 def _find_first_peak_s(
-    train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, duty: float
+    train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: float, duty: float
 ) -> float:
     """Return the time from the start of a pulse on a cold pixel to its peak, s."""
     width_s = periods * drive.period_s
@@ -325,5 +325,6 @@ def _find_first_peak_s(
 
 
 def limit_pulse_width(drive: DriveRange, max_width_us: int) -> DriveRange:
-    """Limit the drive's pulses to `max_width_us`, but to no less than one PWM period."""
-    return replace(drive, max_periods=max(1, min(drive.max_periods, int(max_width_us * 1e-6 / drive.period_s + 1e-9))))
+    """Limit the drive's pulses to `max_width_us` and whole PWM periods, but to no less than one of them."""
+    max_periods = max(1, min(drive.max_periods, int(max_width_us * 1e-6 / drive.period_s + 1e-9)))
+    return replace(drive, max_periods=max_periods, is_fine=False)

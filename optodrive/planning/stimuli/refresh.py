@@ -61,7 +61,7 @@ BEAM_TIME_MARGIN = 1.05
 
 
 class BeamTimeEstimator:
-    """Estimates the beam time of a picture from the cold state: pulses in whole PWM periods, moves on a short path.
+    """Estimates the beam time of a picture from the cold state: pulses as planned, moves on a short path.
 
     The moves are spread over as much time as the galvo cap requires.
     """
@@ -71,7 +71,8 @@ class BeamTimeEstimator:
         self._scanner, self._servos = config.scanner, build_servo_range(config.scanner)
         self._tolerance_rad, self._pitch_m = min(config.tolerance_rad), config.display.pitch_m
         laser = config.laser
-        self._drive = DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
+        width_max_s, is_fine = config.limits.pulse_width_max_s, not laser.whole_periods
+        self._drive = DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, width_max_s, is_fine=is_fine)
         known = load_pixel_map(config)
         self._lift = None if known is None else known.displacement_factor
         self._galvo_time = GalvoTimeEstimator(config)

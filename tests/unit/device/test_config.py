@@ -30,7 +30,14 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
     assert len(resolved["display"]["pixels"]) == 437
     assert set(resolved["display"]["pixels"][0]) == {"index", "x_m", "y_m", "bridge_width_m"}
     assert set(resolved["pixel_model"]) >= {"R", "C", "epsilon", "tau_g", "kappa", "phi"}
-    assert set(resolved["laser"]) == {"max_power_w", "pwm_hz", "threshold_w", "focus_width_m", "focus_height_m"}
+    assert set(resolved["laser"]) == {
+        "max_power_w",
+        "pwm_hz",
+        "whole_periods",
+        "threshold_w",
+        "focus_width_m",
+        "focus_height_m",
+    }
     assert {"bandwidth_hz", "damping", "delay_s", "slew_rad_per_s", "aim_error_m"} <= set(resolved["scanner"])
     assert resolved["scanner"]["settling_pitch_s"] == pytest.approx(383e-6)
     assert set(resolved["limits"]) >= {

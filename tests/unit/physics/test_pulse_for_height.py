@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,7 +14,7 @@ DRIVE = DriveRange.from_laser(2.45, 5000.0, 0.050)
 
 def pulse_for_peak(pixel, theta_k, gamma_k, target_m, drive, min_periods=1, from_s=0.0):
     target_k = target_m / pixel.kappa_m_per_k
-    span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
+    span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods, drive.is_fine)
     periods, duty = find_shortest_pulse(pixel, theta_k, gamma_k, target_k, *span, from_s)
     return (periods, duty) if periods else None
 
@@ -62,6 +64,25 @@ def test_it_is_the_shortest_width_that_can():
     shorter = pulse_peak(PIXEL, 0.0, 0.0, 2.45, (periods - 1) * DRIVE.period_s)[0] * PIXEL.kappa_m_per_k
     assert shorter < 100e-6
     assert duty > 0.9 * (periods - 1) / periods
+
+
+@given(share=st.floats(1e-2, 1.0), theta=st.floats(0.0, 20.0))
+def test_a_fine_pulse_of_more_than_a_period_has_full_power_and_the_nearest_microsecond(share, theta):
+    fine, target_m = replace(DRIVE, is_fine=True), share * max_displacement_m(PIXEL, DRIVE)
+    whole, pulse = (pulse_for_peak(PIXEL, theta, 0.0, target_m, drive) for drive in (DRIVE, fine))
+    if whole is None or whole[0] == 1:
+        assert pulse == whole
+        return
+    periods, duty = pulse
+    width_us = periods * DRIVE.period_s * 1e6
+    assert duty == 1.0
+    assert width_us == pytest.approx(round(width_us), abs=1e-6)
+
+    def miss_m(us):
+        return abs(pulse_peak(PIXEL, theta, 0.0, 2.45, us * 1e-6)[0] * PIXEL.kappa_m_per_k - target_m)
+
+    assert miss_m(width_us) <= min(miss_m(width_us - 1), miss_m(width_us + 1)) + 1e-15
+    assert 1e6 * DRIVE.period_s * (whole[0] - 1) <= width_us <= 1e6 * DRIVE.period_s * whole[0]
 
 
 def test_no_pulse_where_the_heat_is_enough():

@@ -6,9 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedError
 from optodrive.core.types.plans import PulsePlan
+from optodrive.planning.limiter import limiter
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.caps import CAPS
 from optodrive.planning.limiter.limiter import (
@@ -59,7 +62,7 @@ SERVO = GalvoModel(
 def build_budget(**caps):
     """Build a budget in which only the given caps bind."""
     caps = NO_CAPS._replace(**caps)
-    return Budget(caps, build_heat_bound(MODEL, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO))
+    return Budget(caps, build_heat_bound(MODEL, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO), np.full(1, 2e-4))
 
 
 WITHOUT_CAPS = build_budget()
@@ -181,7 +184,7 @@ def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
 def test_a_model_without_walls_is_bounded_by_its_absorber_alone():
     caps = NO_CAPS._replace(absorber_k=150.0)
     bare = replace(MODEL, walls=None, touch=None)
-    budget = Budget(caps, build_heat_bound(bare, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO))
+    budget = Budget(caps, build_heat_bound(bare, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO), np.full(1, 2e-4))
     gentle = run(budget, (1, 0.0, 0.050, 1.0), (1, 9.0, 0.050, 1.0))
     assert gentle.trimmed_j.sum() == 0
     limited = run(budget, (1, 0.0, 0.050, 2.45), (0, 100.0, 0.050, 2.45))
@@ -308,3 +311,26 @@ def test_the_energy_window_agrees_with_an_exhaustive_search():
             append(chain, 0, history, row)
             rows.append((time, width, power))
             time += width
+
+
+def compute_pwm_energy_j(width_s, duty, period_s=2e-4, full_w=2.45):
+    """Return the energy of a pulse on a laser with a PWM that begins with the pulse."""
+    whole, rest_s = divmod(width_s + 1e-12, period_s)
+    return full_w * (whole * duty * period_s + min(rest_s, duty * period_s))
+
+
+@given(width_us=st.integers(200, 40_000), share=st.floats(0.05, 0.999))
+def test_a_pulse_trimmed_within_a_period_of_the_pwm_keeps_the_cap(width_us, share):
+    width_s = 1e-6 * width_us
+    cap_j = share * 2.45 * width_s
+    plan, _ = limit(pulses((0, 0.01, width_s, 2.45)), build_cold_budget_state(3), build_budget(pulse_energy_j=cap_j))
+    energy_j = compute_pwm_energy_j(width_s, plan.power_w[0] / 2.45)
+    assert energy_j <= cap_j * (1.0 + 1e-6)
+    assert energy_j >= 0.99 * cap_j
+
+
+def test_a_limiter_without_regard_to_split_periods_is_caught(monkeypatch):
+    """Mutant: the mean power counts for any width."""
+    monkeypatch.setattr(limiter, "_allow_for_split_period", lambda plan, power_w, budget: power_w)
+    plan, _ = limit(pulses((0, 0.01, 1.1e-3, 2.45)), build_cold_budget_state(3), build_budget(pulse_energy_j=1.35e-3))
+    assert compute_pwm_energy_j(1.1e-3, plan.power_w[0] / 2.45) > 1.03 * 1.35e-3

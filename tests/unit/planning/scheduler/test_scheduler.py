@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.daemon.engine.plan_making import dim_display
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler.scheduler import GalvoPause, Scheduler
 
@@ -36,6 +38,35 @@ def test_times_are_whole_microseconds_and_widths_whole_pwm_periods(display):
     plan = plan_frames(display, frame(display, {3: 77.7, 99: 12.3, 400: 311})).plan
     assert np.allclose(plan.start_s * 1e6, np.round(plan.start_s * 1e6), atol=1e-6)
     assert np.allclose(plan.width_s / 2e-4, np.round(plan.width_s / 2e-4), atol=1e-9)
+
+
+def build_fine(display):
+    """Return a display whose laser is gated in microseconds at full power."""
+    laser = display.config.laser.model_copy(update={"whole_periods": False})
+    return DisplayModel.from_config(display.config.model_copy(update={"laser": laser}))
+
+
+def test_widths_at_full_power_are_whole_microseconds_where_the_gate_allows_it(display):
+    fine = build_fine(display)
+    planned = plan_frames(fine, frame(fine, {3: 77.7, 99: 12.3, 200: 1.0, 400: 311}))
+    plan = planned.plan
+    for times_s in (plan.start_s, plan.width_s):
+        assert np.allclose(times_s * 1e6, np.round(times_s * 1e6), atol=1e-6)
+    is_full = plan.power_w == display.config.laser.max_power_w
+    assert is_full.tolist() == [pixel != 200 for pixel in plan.pixel.tolist()]
+    assert plan.width_s[~is_full] == pytest.approx(2e-4)
+    assert planned.predicted_m == pytest.approx(plan.target_m, rel=1e-3)
+    dimmed = plan_frames(dim_display(fine, 0.5), frame(fine, {3: 77.7, 400: 311})).plan
+    assert np.allclose(dimmed.width_s / 2e-4, np.round(dimmed.width_s / 2e-4), atol=1e-9)
+
+
+@pytest.mark.parametrize(("height_um", "rate_min_hz"), [(50.0, 328.0), (20.0, 690.0)])
+def test_gates_in_microseconds_draw_a_full_frame_faster(display, height_um, rate_min_hz):
+    fine = build_fine(display)
+    planned = plan_frames(fine, frame(fine, dict.fromkeys(range(437), height_um), duration=10.0))
+    assert len(planned.plan) / planned.duration_s >= rate_min_hz
+    of_whole = plan_frames(display, frame(display, dict.fromkeys(range(437), height_um), duration=10.0))
+    assert planned.duration_s < 0.96 * of_whole.duration_s
 
 
 def test_a_train_keeps_its_times_and_a_frame_fills_the_gaps(display):
