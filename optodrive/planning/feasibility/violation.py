@@ -108,7 +108,7 @@ def beam_lower_bound_s(
         starts_s = lead_in_s + train.pulse_starts_s()
         inside = (starts_s >= at_s) & (starts_s + lead_in_s + train.pulse_width_s <= deadline_s)
         train_s += train.pulse_width_s * int(np.count_nonzero(inside))
-    return round((sum(width_s.values()) + settling_s + train_s) / stages, 9)  # a bound must not exceed by rounding
+    return (sum(width_s.values()) + settling_s + train_s) / stages
 
 
 def _select_falling_pixels(heat: ThermalState, pixels: IntArray, at_s: float) -> IntArray:

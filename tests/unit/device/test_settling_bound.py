@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from focus_judge import ExactServo
+from optodrive.device.config_file import load_config
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo, ServoRange
 from optodrive.device.settling_bound import bound_departure_s, bound_settling_s
@@ -96,3 +97,45 @@ def test_corners_alone_would_open_the_gate_early():
     slowest_s = max(sample_times_s(servos, move_rad, 3000, tolerance_rad=3.85e-3))
     assert slowest_s > 1.03 * max(corner_times_s(servos, move_rad, tolerance_rad=3.85e-3))
     assert slowest_s <= bound_settling_s(servos, move_rad, move_rad, 3.85e-3)
+
+
+DISPLAY_437 = load_config("display-437")
+
+
+def follow_ramp(half_width):
+    """Return the time before which no command brings the slowest servo of a range one pitch on, s.
+
+    The target of a step without end moves at the slew limit; that of any commands is behind it. The servo's impulse
+    response is positive until then, so the angle of any commands is behind, too.
+    """
+    servos, (_, tolerance_rad) = ServoRange(SHIPPED.servo, *[half_width] * 3, 1e-5), DISPLAY_437.tolerance_rad
+    pitch_rad = DISPLAY_437.display.pitch_m / (2.0 * DISPLAY_437.scanner.focal_length_m)
+    slowest = servos.servo_at(-1.0, 1.0, -1.0, 1.0)
+    t_s = np.arange(0.0, 4e-4, 1e-6)
+    root = np.sqrt(1.0 - slowest.damping**2)
+    assert t_s[-1] - slowest.delay < 1.0 / (2.0 * slowest.frequency * root)  # half an oscillation
+    return (
+        slowest,
+        pitch_rad - tolerance_rad,
+        t_s[np.argmax(follow_step(slowest, 1.0, t_s) >= pitch_rad - tolerance_rad)],
+    )
+
+
+@pytest.mark.parametrize(("half_width", "bound_us"), [(0.1, 271), (0.02, 249)])
+@given(
+    steps=st.lists(st.tuples(st.floats(0.0, 2.5e-4), st.floats(-0.03, 0.03)), min_size=1, max_size=4),
+)
+def test_no_steps_settle_a_move_of_one_pitch_before_the_slew_limit_allows(half_width, bound_us, steps):
+    """Several steps in place of one cannot bring the dark time of a pitch below this, however they are shaped."""
+    slowest, enough_rad, reached_s = follow_ramp(half_width)
+    assert 1e6 * reached_s == pytest.approx(bound_us, abs=2.0)
+    at_s = np.cumsum([0.0] + [gap_s for gap_s, _ in steps[1:]])
+    scanner = SimpleNamespace(
+        bandwidth_hz=slowest.frequency,
+        damping=slowest.damping,
+        delay_s=slowest.delay,
+        slew_rad_per_s=slowest.slew,
+    )
+    t_s = np.arange(0.0, 4e-4, 1e-6)
+    angles_rad = ExactServo(scanner).angles(at_s, np.array([level_rad for _, level_rad in steps]), t_s)
+    assert (angles_rad[t_s < reached_s - 2e-6] < enough_rad).all()

@@ -1,5 +1,7 @@
 """Displays with terms: nominal without terms, and equal to single pixels in `pixel_ode` with them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -93,6 +95,10 @@ def test_without_terms_it_is_the_nominal_display(seed):
         theirs = nominal.solve_pulse(1, end_s, target_m, DRIVE)
         assert periods * duty == pytest.approx(theirs[0] * theirs[1], rel=1e-3)
         assert abs(periods - theirs[0]) <= 1
+        fine = replace(DRIVE, is_fine=True)
+        assert ours.solve_pulse(1, end_s, target_m, fine) == pytest.approx(
+            nominal.solve_pulse(1, end_s, target_m, fine), rel=1e-3
+        )
     assert ours.max_displacement_m(DRIVE) == pytest.approx(nominal.max_displacement_m(DRIVE), rel=2e-4)
 
 
@@ -133,15 +139,16 @@ def test_every_pixel_sees_the_panel_that_light_on_others_warmed(rest_s):
     assert heat.state_at(at_s + 0.05).displacement_m[5] > displacement_m[1]
 
 
+@pytest.mark.parametrize("is_fine", [False, True])
 @pytest.mark.parametrize("key", [*SINGLE, "radiation+gas_leak"])
-def test_a_pulse_asked_for_a_height_reaches_it_after_others(key):
+def test_a_pulse_asked_for_a_height_reaches_it_after_others(key, is_fine):
     keys = key.split("+")
     for target_m in (8e-5, 2.5e-4, 4.5e-4):
         heat = extended(*keys)
         before = some_pulses(4, 10, pixels=(5,))
         heat.apply_pulses(*before)
         at_s = before[1][-1] + 0.06
-        periods, duty = heat.solve_pulse(5, at_s, target_m, DRIVE)
+        periods, duty = heat.solve_pulse(5, at_s, target_m, replace(DRIVE, is_fine=is_fine))
         assert 0 < periods <= DRIVE.max_periods
         assert 0 < duty <= 1
         one = (np.array([5]), np.array([at_s]), np.array([periods * DRIVE.period_s]), np.array([duty * FULL_W]))
