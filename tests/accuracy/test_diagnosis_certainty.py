@@ -109,7 +109,7 @@ def measure_planned_errors(found, folder):
 
 
 def test_a_leak_of_another_form_states_the_error_of_heights_planned_with_it(leak, tmp_path):
-    """98.8 % of the excess χ² is explained, and yet fingers feel other heights than planned."""
+    """99.5 % of the excess χ² is explained, and yet fingers feel other heights than planned."""
     assert (leak.verdict, leak.causes) == ("cause", ("gas_leak",))
     assert leak.explained_fraction > 0.98
     held_out, fitted = leak.height_error_held_out, leak.height_error_fitted
