@@ -92,9 +92,7 @@ def test_overflow_and_ceiling_of_two_tanks():
     by_hand = float(np.sqrt(np.mean((simulate(unseen) - unseen.outputs) ** 2)))
     forms = {each.term.chosen.where: (each.term.chosen.kind, each.term.chosen.depends_on) for each in answer.findings}
     assert forms == {"dupper/dt": ("end stop", ("upper",)), "level": ("end stop", ("lower",))}
-    assert by_hand < 0.022
-    # By hand the valley of the overflow's threshold is left, in which the search's last fit ends: 0.077 V.
-    assert rmse(answer, unseen) < 5.0 * by_hand
+    assert rmse(answer, unseen) < 1.1 * by_hand
 
 
 @pytest.mark.parametrize("samples_per_period", [200.0, 9.0])

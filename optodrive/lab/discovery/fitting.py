@@ -8,7 +8,8 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
-from optodrive.lab.discovery.integration import MEMORY, STEP, VARIABLE, Kernels, allocate_work, build_kernels
+from optodrive.lab.discovery.forms import THRESHOLDS
+from optodrive.lab.discovery.integration import FORM, MEMORY, STEP, VARIABLE, Kernels, allocate_work, build_kernels
 from optodrive.lab.discovery.linearisation import Linearisation
 from optodrive.lab.discovery.memory import NONE, PATH
 from optodrive.lab.discovery.model import OdeModel, Record
@@ -55,6 +56,12 @@ class Terms:
     def weaken(self, share: float) -> "Terms":
         """Return the same terms with this share of their amplitudes."""
         return replace(self, values=self.values * [share, 1.0, 1.0, 1.0])
+
+    def free_thresholds(self, beyond: float) -> "Terms":
+        """Return the same terms with limits of thresholds that lie further apart, by this share on either side."""
+        rows, further = np.isin(self.table[:, FORM], THRESHOLDS), np.zeros_like(self.low)
+        further[rows, 1] = beyond * (self.high - self.low)[rows, 1]
+        return replace(self, low=self.low - further, high=self.high + further)
 
     @property
     def memories(self) -> IntArray:

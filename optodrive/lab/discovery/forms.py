@@ -25,6 +25,8 @@ from optodrive.core.types.arrays import FloatArray
     DECAY,
 ) = range(14)
 CURVES = (SINE, COSINE, BUMP)
+THRESHOLDS = (DEAD_ZONE, ABOVE, BELOW, STEP, CLIP)
+"""Forms whose first inner number is a value of the variable."""
 MAX_EXPONENT = 50.0
 CONSTANT, CURVE, CHANGE = "constant", "curve", "change with time"
 """Kinds that are no names: what follows the data without a formula of physics, and what no state explains."""

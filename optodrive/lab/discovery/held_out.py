@@ -26,8 +26,9 @@ SEARCH_SAMPLES = 12_000
 
 SHORT_FIT, MEMORY_FIT, LONG_FIT = 12, 24, 60
 """Steps of a fit of a rival, of one with memory, whose scale starts from a coarse grid, and of what was chosen."""
-WEAK = 0.1
-"""Share of a term's amplitude from which the last fit begins once more."""
+BEYOND, WEAK = 2.0, 0.1
+"""How much further a threshold may move in the last fit, relative to its limits, and the share of a term's amplitude
+from which that fit begins once more."""
 PARTS = 64
 """Parts of a split's held-out samples in which forms are compared."""
 WITHIN_NOISE = 1.1
@@ -164,8 +165,10 @@ class FreeRuns:
     def fit_everything(self, point: Point) -> Point:
         """Return the fit of free runs to all samples, from a point, or from its terms as weak ones.
 
-        Beside a kink a strong term ends in a valley of its own.
+        Beside a kink a strong term ends in a valley of its own. Thresholds may leave the range along the search's
+        filter: parameters change that of a state which nobody measures.
         """
+        point = point.with_terms(point.terms.free_thresholds(BEYOND))
         masks = [np.full(len(record.t_s), True) for record in self.records]
         weak = point.with_terms(point.terms.weaken(WEAK))
         fits = [self.fit([each], masks, is_long=True) for each in (point, weak)]
