@@ -32,6 +32,8 @@ from stage_loss_rig import LossRig
 NAME = "display-437"
 DARK_S = 0.004
 """Time from an answer to the end of the light: one exchange with the board."""
+RESENT_S = 0.05
+"""Time within which a link that has lost frames has sent them again, before what follows them."""
 PIXELS_PER_CUT = 2
 """Pulses within the way to the board, of which nobody knows whether they came before the light was turned off."""
 PIXELS_PER_LATE_CUT = 4
@@ -110,6 +112,7 @@ class QueueMachine(RuleBasedStateMachine):
             record = plans[number % len(plans)].record
             self.cuts += record.status == "running"
             self.rig.queue.cancel(record)
+            self.rig.run()  # the link process sends it
             self.withdrawn_s[record.plan_id] = self.now_s()
 
     @rule()
@@ -216,7 +219,8 @@ class QueueMachine(RuleBasedStateMachine):
             counts[pixel] = counts.get(pixel, 0) + 1
             push = owner[pixel]
             assert on_s <= [*self.ends_s, inf][push.epoch] + self.dark_s, "light after its epoch"
-            assert on_s <= self.withdrawn_s.get(push.record.plan_id, inf) + self.dark_s, "light of a withdrawn push"
+            dark_s = self.withdrawn_s.get(push.record.plan_id, inf) + self.dark_s + RESENT_S * self.may_be_late
+            assert on_s <= dark_s, "light of a withdrawn push"
             for begun_s, ended_s in self.pauses_s:
                 assert not begun_s + self.dark_s < on_s < ended_s, "light in a pause"
         for push in self.pushed:
