@@ -103,6 +103,8 @@ class QueueMachine(RuleBasedStateMachine):
     def stream(self, count, height_um, refreshes):
         """A frame that replaces what is unsent, and is extended later if it is long."""
         options = {"streamed": True, "lists_pulses": False, "refreshes": refreshes}
+        # What is no stream ends for it, with the gate off.
+        self.cuts += any(not run.plan.record.streamed for run in self.rig.queue.state.running)
         self.push(lambda at: build_frame(at, height_um), count, 1, **options)
 
     @rule(number=st.integers(0, 5))
