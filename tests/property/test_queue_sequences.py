@@ -318,8 +318,9 @@ class StageMachine(QueueMachine):
 
 EXAMPLES = settings.default.max_examples
 GATE = settings(
-    max_examples=settings.default.max_examples, stateful_step_count=20, phases=(Phase.generate, Phase.reuse)
+    max_examples=settings.default.max_examples, stateful_step_count=20, phases=(Phase.generate,), derandomize=True
 )
+"""Of every run the same sequences; the slow test draws others."""
 
 
 def test_no_pulse_is_lit_twice_or_late_and_heat_is_counted_once():
@@ -335,7 +336,7 @@ def test_nor_when_a_stage_is_lost():
 @pytest.mark.parametrize("piece", range(100))
 def test_the_same_in_a_hundred_thousand_sequences(piece):
     machine = StageMachine if piece % 10 == 9 else QueueMachine
-    many = settings(GATE, max_examples=1000, database=None)
+    many = settings(GATE, max_examples=1000, derandomize=False)
     run_state_machine_as_test(seed(piece)(type("Piece", (machine,), {})), settings=many)
 
 
