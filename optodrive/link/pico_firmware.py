@@ -33,7 +33,7 @@ HEADER = """/* Settings of the board of {name}, by `optodrive board settings`: i
 #ifndef SETTINGS_H
 #define SETTINGS_H
 
-#include "board.h"
+#include "chip.h"
 
 #define HOST_BAUD {baud}u
 #define GATE_HZ {gate_hz}u

@@ -8,6 +8,7 @@
 
 #include "board.h"
 
+#define FIRMWARE 0x00010100u /* version of this port */
 #define CLOCK_HZ 125000000u
 #define CHIP_SLEEP_US 250u
 

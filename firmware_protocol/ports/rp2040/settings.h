@@ -3,7 +3,7 @@
 #ifndef SETTINGS_H
 #define SETTINGS_H
 
-#include "board.h"
+#include "chip.h"
 
 #define HOST_BAUD 1000000u
 #define GATE_HZ 50000u /* PWM frequency of the duty, within the bandwidth of the laser driver */
