@@ -75,8 +75,8 @@ class TimedPulses(Protocol):
 MAX_WAIT_S = 3600.0
 """A plan that does not fit after this time with the gate off never fits."""
 WAIT_RESOLUTION_S = 1e-3
-TICK_ROUNDING_S = 1e-6
-"""Difference from whole PWM periods that rounding to a microsecond makes."""
+TICK_ROUNDING_S = 5.01e-7
+"""Largest difference from whole PWM periods that rounding to a microsecond makes; one of a microsecond is light."""
 
 
 def build_cold_budget_state(pixel_count: int, at_s: float = 0.0, stage_count: int = 1) -> BudgetState:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedError
@@ -320,6 +320,7 @@ def compute_pwm_energy_j(width_s, duty, period_s=2e-4, full_w=2.45):
 
 
 @given(width_us=st.integers(200, 40_000), share=st.floats(0.05, 0.999))
+@example(width_us=201, share=0.5)
 def test_a_pulse_trimmed_within_a_period_of_the_pwm_keeps_the_cap(width_us, share):
     width_s = 1e-6 * width_us
     cap_j = share * 2.45 * width_s
