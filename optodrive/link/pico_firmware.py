@@ -5,6 +5,7 @@ as a simulated board of that display has them (`permit_retiming`), and a range o
 the margin of the tasks that calibrate. Everything else of the image is the same for every display.
 """
 
+import re
 import shutil
 import subprocess
 import tempfile
@@ -70,10 +71,10 @@ class PicoSettings(NamedTuple):
     uid: str
 
     def to_header(self, name: str) -> str:
-        """Return settings.h for the display of this name."""
+        """Return settings.h for the display of this name, which may neither end nor begin a comment of C."""
         limits = "\n".join(f"            .{key} = {value}," for key, value in asdict(self.limits).items())
         uid = ", ".join(f"0x{byte:02x}" for byte in bytes.fromhex(self.uid))
-        return HEADER.format(**self._asdict() | {"name": name.replace("*/", "* /"), "limits": limits, "uid": uid})
+        return HEADER.format(**self._asdict() | {"name": name.replace("/", " "), "limits": limits, "uid": uid})
 
 
 def build_pico_settings(config: Config, margin_m: float, uid: str) -> PicoSettings:
@@ -84,6 +85,8 @@ def build_pico_settings(config: Config, margin_m: float, uid: str) -> PicoSettin
     """
     if config.board.transport not in ("serial", "usb", "simulated"):
         raise InputError("board.transport", config.board.transport, "serial or usb, as a board of one's own has")
+    if config.board.uid and not re.fullmatch(r"[0-9a-fA-F]{24}", config.board.uid):
+        raise InputError("board.uid", config.board.uid, "24 hexadecimal digits, as a board's uid has")
     requirements = build_bench_requirements(config, margin_m)
     if requirements.pixels > CELLS_MAX:
         raise InputError("display pixels", requirements.pixels, f"at most {CELLS_MAX}, the spots that a Pico can guard")

@@ -29,13 +29,14 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 def config(tmp_path):
     """Return a function that writes a shipped configuration with a serial board and other lines."""
 
-    def write(name="display-16", uid=UID, **replaced):
+    def write(name="display-16", uid=UID, name_of_display="", **replaced):
         text = (CONFIGS / f"{name}.toml").read_text()
         own = f'transport = "serial"\nport = "/dev/ttyACM0"\nuid = "{uid}"\n'
         text = re.sub(r'transport = "simulated".*\n', own, text)
         for key, line in replaced.items():
             text, count = re.subn(rf"^{key} = .*$", line, text, flags=re.MULTILINE)
             assert count == 1
+        text = re.sub(r"^name = .*$", name_of_display, text, flags=re.MULTILINE) if name_of_display else text
         path = tmp_path / "own.toml"
         path.write_text(text)
         return path
@@ -111,6 +112,7 @@ def test_a_board_without_uid_gets_one_of_its_own(config, capsys):
     ("replaced", "says"),
     [
         ({"pwm_hz": "pwm_hz = 6e5"}, "laser.pwm_hz: got 600000.0, expected a frequency with a multiple from 30 kHz to"),
+        ({"uid": "zz"}, "board.uid: got 'zz', expected 24 hexadecimal digits"),
         ({"rows": "rows = 40", "columns": "columns = 40", "pitch_m": "pitch_m = 3.0e-3"}, f"at most {CELLS_MAX}"),
     ],
 )
@@ -119,6 +121,11 @@ def test_a_display_that_a_pico_cannot_serve_is_refused_in_one_line(config, capsy
     err = capsys.readouterr().err
     assert says in err
     assert err.count("\n") == 1
+
+
+def test_a_name_does_not_leave_its_comment(config, capsys):
+    assert run(["board", "settings", "--config", str(config(name_of_display='name = "a*/ b /* c"'))]) == 0
+    assert re.findall(r"/\*|\*/", capsys.readouterr().out) == ["/*", "*/"]
 
 
 def test_without_a_compiler_it_says_what_to_install(config, tmp_path, monkeypatch, capsys):
