@@ -7,7 +7,7 @@ made, with a lower cap on the power, or without a lost stage.
 Of a streamed frame only what can be played before the next one arrives is planned at once: the plan is accepted, and
 its points leave, with a `SequencePlanner` that stands behind its last pulse. If no newer frame has replaced the plan
 by the time at which the points behind it must leave, that planner goes on: the same pulses as if the frame had been
-planned as a whole, limited from the budget after the first part and proven as bytes, like those (decision 55).
+planned as a whole, limited from the budget after the first part and proven as bytes, like those.
 """
 
 import threading

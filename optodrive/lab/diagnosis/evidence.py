@@ -22,7 +22,7 @@ Noise. The noise model is an estimate from few repeats, so a difference in evide
 is converted as the likelihood of a Student distribution with the degrees of freedom of the noise (`temper`), relative
 to the best explanation, so that rivals which nearly agree are compared almost as normal ones.
 
-The priors, the two shares and the temperature were set on development seeds of the blind generator (decision 50), whose
+The priors, the two shares and the temperature were set on development seeds of the blind generator, whose
 reliability diagram `scripts/bench calibration` draws on others.
 
 Certainty of the noise. The noise model is an estimate: of the jitters of power and timing and of the baselines from as

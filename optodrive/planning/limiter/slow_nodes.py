@@ -28,7 +28,9 @@ Invariants. Without credit the result is a lower bound of the power with credit,
 credit never costs power. The result never exceeds the requested power. A power of 0 always passes, because the state
 before the pulse was within the set, unless the panel has taken the cap away.
 
-What it is worth: decision 7 (cost, and what was rejected). Decision 45 says how the panel enters.
+Rejected: one run per corner of the parameter box, as the worst case need not be a corner, and a wall whose capacity may
+change at any moment, with which a train ratchets up by the ratio of both capacities. Decision 45 says how the panel
+enters.
 """
 
 from math import exp, inf, log
