@@ -9,7 +9,7 @@ import numpy as np
 from optodrive.client.display import Display
 from optodrive.client.plan import Plan
 from optodrive.core.errors import RefusedError
-from optodrive.study.presenter import TIME_TOLERANCE_S, Presentation
+from optodrive.study.presenter import TIME_TOLERANCE_S, Presentation, RequestedStimulus
 from optodrive.study.study_file import Value
 
 
@@ -42,11 +42,23 @@ class DaemonPresenter:
             power_w=np.asarray([] if columns is None else columns.power_w, dtype=np.float64),
             fault=find_fault(plan),
             onset_monotonic_s=None if plan.onset is None else plan.onset.monotonic_s,
+            height_m=None if columns is None or not columns.simulated_um else 1e-6 * max(columns.simulated_um),
+            requested=_describe_request(plan),
         )
 
     def wait(self, duration_s: float) -> None:
         """Wait by the computer's clock."""
         time.sleep(duration_s)
+
+
+def _describe_request(plan: Plan) -> RequestedStimulus | None:
+    """Return the stimulus as it was planned, None if its pulses are not known."""
+    planned, executed = plan.pulses, plan.executed_pulses
+    if plan.onset is None or planned is None or executed is None or not executed.start_s or not planned.start_s:
+        return None
+    onset_s = plan.onset.board_s - (executed.start_s[0] - planned.start_s[0])
+    target_m = 1e-6 * np.array([np.nan if target_um is None else target_um for target_um in planned.target_um])
+    return RequestedStimulus.from_plan(onset_s, np.asarray(planned.start_s), np.asarray(planned.width_s), target_m)
 
 
 def find_fault(plan: Plan) -> str | None:

@@ -40,6 +40,7 @@ COLUMNS: dict[str, dict[str, Any]] = {
         "Description": "Number of the attempt that counts; more than 1 after an interruption or a failed stimulus"
     },
     "answer": {"Description": "The participant's answer"},
+    "correct_answer": {"Description": "The answer that is correct; n/a where none is"},
     "is_correct": {"Description": "Whether the answer is the correct one", "Levels": {"0": "no", "1": "yes"}},
     "response_time": {"Description": "Time from the end of the stimulus to the answer", "Units": "s"},
     "response_latency": {
@@ -57,6 +58,19 @@ COLUMNS: dict[str, dict[str, Any]] = {
         "Units": "s",
     },
     "stimulus_duration": {"Description": "Time from the first pulse's start to the last one's end", "Units": "s"},
+    "stimulus_height": {
+        "Description": "Largest displacement of any pixel by the executed pulses, as the thermal model computes it",
+        "Units": "um",
+    },
+    "requested_onset": {
+        "Description": "Time at which the last presentation was due, by the clock of stimulus_onset",
+        "Units": "s",
+    },
+    "requested_duration": {"Description": "Duration of the stimulus as requested", "Units": "s"},
+    "requested_height": {
+        "Description": "Largest displacement that the stimulus requests; n/a of a stimulus stated by power",
+        "Units": "um",
+    },
     "executed_pulses": {"Description": "Number of light pulses of the last presentation that the board executed"},
 }
 
@@ -143,13 +157,13 @@ def _write_task(folder: Path, path: Path) -> None:
     head, trials = read_log(path)
     beh = folder / path.parent.name / "beh"
     create_folder(beh)
-    stem, factors = path.name.removesuffix(LOG_SUFFIX) + "_beh", list(_list_varied(head["study"]))
-    rows = [_build_row(record, factors) for record in trials]
-    write_text(beh / f"{stem}.tsv", _format_table([*list(COLUMNS)[:3], *factors, *list(COLUMNS)[3:]], rows))
+    stem, parameters = path.name.removesuffix(LOG_SUFFIX) + "_beh", list(_list_parameters(head["study"]))
+    rows = [_build_row(record, parameters) for record in trials]
+    write_text(beh / f"{stem}.tsv", _format_table([*list(COLUMNS)[:3], *parameters, *list(COLUMNS)[3:]], rows))
     write_text(beh / f"{stem}.json", _dump(_describe_task(head["study"])))
 
 
-def _build_row(record: Mapping[str, Any], factors: Sequence[str]) -> list[str]:
+def _build_row(record: Mapping[str, Any], parameters: Sequence[str]) -> list[str]:
     last = record["presentations"][-1]
     executed, correct = last["executed"], record["is_correct"]
     ends_s = [start_s + width_s for start_s, width_s in zip(executed["start_s"], executed["width_s"], strict=True)]
@@ -157,12 +171,20 @@ def _build_row(record: Mapping[str, Any], factors: Sequence[str]) -> list[str]:
         record["trial"] + 1,
         record["run"],
         record["attempt"],
-        *(record["condition"][factor] for factor in factors),
+        *(record["requested"]["parameters"][name] for name in parameters),
     ]
-    cells += [record["answer"], "n/a" if correct is None else int(correct), record["response_time_s"]]
+    cells += [record["answer"], record.get("correct_answer") or "n/a", "n/a" if correct is None else int(correct)]
+    cells += [record["response_time_s"]]
     cells += ["n/a" if record.get(name) is None else record[name] for name in ("response_latency_s", "early_answers")]
-    cells += [len(record["presentations"]), last["onset_s"], round(max(ends_s), 6), len(executed["pixel"])]
+    requested = last.get("requested") or {}
+    cells += [len(record["presentations"]), last["onset_s"], round(max(ends_s), 6), _format_um(last.get("height_m"))]
+    cells += [requested.get("onset_s", "n/a"), requested.get("duration_s", "n/a")]
+    cells += [_format_um(requested.get("height_m")), len(executed["pixel"])]
     return [str(cell) for cell in cells]
+
+
+def _format_um(height_m: float | None) -> str:
+    return "n/a" if height_m is None else f"{1e6 * height_m:.3f}"
 
 
 def _describe_task(study: Mapping[str, Any]) -> dict[str, Any]:
@@ -172,7 +194,7 @@ def _describe_task(study: Mapping[str, Any]) -> dict[str, Any]:
         columns["answer"]["Levels"] = {escape_formula(answer): answer for answer in response["answers"]}
     else:
         columns["answer"]["Description"] += ", a magnitude between 0 and 1"
-    for factor, values in _list_varied(study).items():
+    for factor, values in _list_parameters(study).items():
         columns[factor] = {
             "Description": f"Parameter `{factor}` of the stimulus `{study['stimulus']['pattern']}`",
         } | ({"Levels": {escape_formula(str(value)): str(value) for value in values}} if values else {})
@@ -181,16 +203,29 @@ def _describe_task(study: Mapping[str, Any]) -> dict[str, Any]:
         "TaskDescription": f"{study['title']}: {_describe_procedure(study)}",
         "Instructions": response["question"],
         **columns,
+        "Analysis": _describe_analysis(study),
         "StimulusPresentation": {"SoftwareName": "optodrive", "SoftwareVersion": version("optodrive")},
         "Design": study,
     }
 
 
-def _list_varied(study: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """Return the values of each parameter that varies between trials, none of one that is chosen freely."""
+def _describe_analysis(study: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the guess rate, the column of levels and those of the factors, which an analysis needs."""
+    procedure = study.get("procedure")
+    return {
+        "GuessRate": study["response"]["chance_level"],
+        "Level": None if procedure is None else procedure["parameter"],
+        "Factors": list(study["factors"]),
+    }
+
+
+def _list_parameters(study: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Return the values of each parameter of the stimulus, none of one that is chosen freely."""
     procedure = study.get("procedure")
     matched: dict[str, list[Any]] = {name: [] for name in MATCHED_PARAMETERS} if study.get("matching") else {}
-    return {**study["factors"], **({procedure["parameter"]: procedure["levels"]} if procedure else {}), **matched}
+    constants = {name: [value] for name, value in study["stimulus"]["parameters"].items()}
+    levels = {procedure["parameter"]: procedure["levels"]} if procedure else {}
+    return {**study["factors"], **levels, **matched, **constants}
 
 
 def _describe_procedure(study: Mapping[str, Any]) -> str:

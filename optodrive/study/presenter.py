@@ -1,8 +1,8 @@
 """Presentation of stimuli and its interface, and simulated boards in virtual time that present them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -23,6 +23,24 @@ COOLING_STEP_S, COOLING_MAX_S = 5.0, 600.0
 """Step and total of the waiting for a display that is too warm for a stimulus."""
 
 
+class RequestedStimulus(NamedTuple):
+    """A stimulus as it was planned: onset on the board's clock, duration, and largest height.
+
+    height_m: None of a stimulus that is stated by power
+    """
+
+    onset_s: float
+    duration_s: float
+    height_m: float | None
+
+    @classmethod
+    def from_plan(cls, onset_s: float, start_s: FloatArray, width_s: FloatArray, target_m: FloatArray) -> Self:
+        """Build it from the planned pulses, [n] each. target_m: NaN of a pulse without a requested height."""
+        duration_s = float((start_s + width_s).max(initial=0.0) - start_s.min(initial=np.inf)) if len(start_s) else 0.0
+        height_m = float(np.nan_to_num(target_m).max(initial=0.0))
+        return cls(round(onset_s, 9), round(duration_s, 9), round(height_m, 12) or None)
+
+
 @dataclass(frozen=True, eq=False)
 class Presentation(ReadOnlyArrays):
     """A stimulus as the board reports it, one row per pulse, all arrays [n].
@@ -30,6 +48,8 @@ class Presentation(ReadOnlyArrays):
     onset_s: gate on of the first pulse on the board's clock; start_s: counted from it
     fault: how it differs from the request, None if it is as requested; cooling_s: waited for before it
     onset_monotonic_s: onset_s on the host's CLOCK_MONOTONIC, None of a board in virtual time
+    height_m: largest displacement of any pixel, computed from the executed pulses; None if it is not known
+    requested: the same stimulus as it was planned, None if it is not known
     """
 
     onset_s: float
@@ -40,6 +60,8 @@ class Presentation(ReadOnlyArrays):
     fault: str | None
     cooling_s: float = 0.0
     onset_monotonic_s: float | None = None
+    height_m: float | None = None
+    requested: RequestedStimulus | None = None
 
     @property
     def duration_s(self) -> float:
@@ -55,7 +77,13 @@ class Presentation(ReadOnlyArrays):
         """Return the presentation as JSON values."""
         columns = ("pixel", "start_s", "width_s", "power_w")
         pulses = {name: np.round(getattr(self, name), 9).tolist() for name in columns}
-        return {"onset_s": round(self.onset_s, 9), "cooling_s": self.cooling_s, "executed": pulses}
+        return {
+            "onset_s": round(self.onset_s, 9),
+            "cooling_s": self.cooling_s,
+            "height_m": self.height_m,
+            "requested": None if self.requested is None else self.requested._asdict(),
+            "executed": pulses,
+        }
 
 
 class Presenter(Protocol):
@@ -94,12 +122,22 @@ class VirtualPresenter:
                 cooling_s += COOLING_STEP_S
         self._zero_s = self._boards.now_s + START_LEAD_S
         self._heat, self._budget = planned.heat, planned.budget
-        executed = self._boards.play(planned)
+        executed, plan = self._boards.play(planned), planned.plan
+        columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
         onset_s = float(executed.on_tick[0]) * self._boards.tick_s if len(executed) else 0.0
-        start_s = executed.start_s - executed.start_s.min(initial=np.inf) if len(executed) else executed.start_s
-        shown = Presentation(onset_s, executed.pixel, start_s, executed.width_s, executed.power_w, None, cooling_s)
-        fault = find_fault(planned, shown) if executed.complete else "pulses without a report"
-        return Presentation(onset_s, shown.pixel, start_s, shown.width_s, shown.power_w, fault, cooling_s)
+        late_s = float(executed.start_s[0] - plan.start_s[0]) if len(executed) else 0.0
+        shown = Presentation(
+            onset_s,
+            executed.pixel,
+            executed.start_s - executed.start_s.min(initial=np.inf) if len(executed) else executed.start_s,
+            executed.width_s,
+            executed.power_w,
+            None,
+            cooling_s,
+            height_m=round(float(heat.copy().apply_pulses(*columns).displacement_m.max(initial=0.0)), 12),
+            requested=RequestedStimulus.from_plan(onset_s - late_s, plan.start_s, plan.width_s, plan.target_m),
+        )
+        return replace(shown, fault=find_fault(planned, shown) if executed.complete else "pulses without a report")
 
     def wait(self, duration_s: float) -> None:
         """Let virtual time pass."""

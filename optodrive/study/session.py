@@ -228,6 +228,7 @@ def _build_record(
         "requested": {"pattern": study.stimulus.pattern, "parameters": parameters},
         "presentations": presentations,
         "answer": response.answer,
+        "correct_answer": correct,
         "is_correct": None if correct is None else response.answer == correct,
         "response_time_s": response.response_time_s,
         "response_latency_s": response.latency_s,

@@ -161,3 +161,10 @@ def test_a_persons_session_goes_on_after_a_kill(tmp_path, board, make_daemon, vi
     for record in records:
         if record["record"] == "trial":
             assert_on_the_board(record["presentations"][-1], logged)
+    head, *rows = [line.split("\t") for line in next(tmp_path.glob("data/sub-07/beh/*.tsv")).read_text().splitlines()]
+    for row in rows:
+        cells = dict(zip(head, row, strict=True))
+        assert float(cells["requested_onset"]) == pytest.approx(float(cells["stimulus_onset"]), abs=2e-3)
+        assert float(cells["requested_duration"]) == pytest.approx(float(cells["stimulus_duration"]), abs=4e-6)
+        assert float(cells["stimulus_height"]) > 50.0
+        assert cells["correct_answer"] == cells["digits"]

@@ -8,11 +8,14 @@ import pytest
 from optodrive.core.errors import RefusedError
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.study.observers import Observer, Participant
 from optodrive.study.presenter import VirtualPresenter
 from optodrive.study.session import SimulatedRespondent, draw_order, run_session
 from optodrive.study.study_file import load_study
 from optodrive.study.trial_log import TrialLog
+
+COMPARED = {"first": 10, "second": 200, "first_intensity": 6.0, "second_intensity": 8.0}
 
 
 @pytest.fixture(scope="module")
@@ -66,3 +69,24 @@ def test_a_display_that_never_shows_it_as_requested_ends_the_run(display, tmp_pa
         with pytest.raises(RefusedError, match="trial 1: 5 stimuli were not as requested"):
             run_session(study, log, presenter, respondent)
         assert not log.trials
+
+
+@pytest.mark.parametrize(
+    ("pattern", "parameters", "has_height"),
+    [("detection", {"side": "left", "power_mw": 900.0}, False), ("comparison", COMPARED, True)],
+)
+def test_requested_and_executed_times_and_heights_are_recorded(display, pattern, parameters, has_height):
+    presenter = VirtualPresenter(display)
+    shown = presenter.present(pattern, parameters)
+    presenter.close()
+    t_s = np.arange(0.0, shown.duration_s + 0.05, 1e-4)
+    pulses = np.column_stack([shown.start_s, shown.width_s, shown.power_w, shown.pixel])
+    simulated_m = [display.build_cold_heat().simulate_displacement_m(pulses, int(k), t_s) for k in set(shown.pixel)]
+    assert shown.height_m == pytest.approx(np.max(simulated_m), rel=1e-3)
+    requested = shown.to_record()["requested"]
+    assert requested["onset_s"] == pytest.approx(shown.onset_s, abs=2e-6)
+    assert requested["duration_s"] == pytest.approx(shown.duration_s, abs=2e-6)
+    sequence = build_pattern(pattern, parameters, display.config)
+    heights_m = [train.target_m for train in sequence.trains if hasattr(train, "target_m")]
+    assert requested["height_m"] == (pytest.approx(max(heights_m)) if has_height else None)
+    assert not has_height or shown.height_m == pytest.approx(max(heights_m), rel=0.05)
