@@ -71,6 +71,9 @@ struct board_limits {
 };
 #undef LIMIT_MEMBER
 
+/* How the board tells the mirrors their position. */
+enum interface { INTERFACE_ANALOG, INTERFACE_XY2_100 };
+
 struct board_config {
     struct board_limits limits;
     uint8_t uid[12];
@@ -79,6 +82,7 @@ struct board_config {
     uint16_t queue_points; /* at least DATA_ITEMS_MAX; BOARD_QUEUE_POINTS where it states more */
     uint16_t cells, window_pulses; /* at least 1; BOARD_CELLS and BOARD_PULSES where they state more */
     bool key_edge;
+    uint8_t interface; /* enum interface */
 };
 
 enum reset_cause { RESET_POWER_UP, RESET_RESET, RESET_BROWN_OUT, RESET_WATCHDOG };

@@ -4,6 +4,7 @@ import { readFileSync, writeSync } from "node:fs";
 import { createInterface } from "node:readline";
 
 import { Chip } from "./chip.mjs";
+import { encodeStatus, STATUS_OK } from "./xy2_100.mjs";
 
 const setup = JSON.parse(readFileSync(process.argv[2], "utf8"));
 const emulator = await import(setup.emulator);
@@ -18,6 +19,7 @@ const random = () => {
 };
 
 const computer = { connected: false, awake: true, open: false, reads: true }; // at the USB port
+const head = { frame: encodeStatus(STATUS_OK), line: false, bad: 0 };
 let records = [], pins = new Map(), chip;
 const emit = (...record) => records.push(record);
 const flush = (record) => {
@@ -34,7 +36,7 @@ function start(cause) {
     if (chip.logged) emit("gate", base / 1000, false, 0, -2, 0, 0, 0);
     emit("reset", base / 1000, cause);
   }
-  chip = new Chip(emulator, setup, base, cause, memory, computer, random, emit, () => start("watchdog"));
+  chip = new Chip(emulator, setup, base, cause, memory, computer, head, random, emit, () => start("watchdog"));
   for (const [pin, high] of pins) chip.setPin(pin, high);
 }
 
@@ -54,6 +56,8 @@ const commands = {
     emit("ticks", chip.tickMax, chip.gapMax);
     chip.tickMax = chip.gapMax = 0;
   },
+  head(answer) { Object.assign(head, answer); },
+  frames() { emit("frames", chip.xy2.decoder.frames, chip.xy2.decoder.errors); },
   stack() { emit("stack", ...chip.measureStack()); },
   trace(on) {
     setup.tracing = on;

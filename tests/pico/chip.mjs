@@ -2,6 +2,7 @@
 
 import { Uart } from "./uart.mjs";
 import { UsbHost } from "./usb.mjs";
+import { Xy2100 } from "./xy2_100.mjs";
 
 const RAM = 0x20000000, RAM_BYTES = 264 * 1024, FLASH = 0x10000000;
 const PIN = { hostClosed: 2, estop: 8, key: 9, interlock: 10, indicator: 11, relay: 12, readback: 13, gate: 14, sync: 17, tick: 22 };
@@ -21,8 +22,8 @@ const stub = (read) => ({ readUint32: read, writeUint32() {}, writeUint32Atomic(
 
 export class Chip {
   // cause: "power", "run" (the pin RUN) or "watchdog"; base: nanoseconds since the first power-up; emit: takes records
-  // computer: at the USB port
-  constructor({ RP2040, USBCDC }, setup, base, cause, memory, computer, random, emit, onWatchdog) {
+  // computer: at the USB port; head: what the scan head answers
+  constructor({ RP2040, USBCDC }, setup, base, cause, memory, computer, head, random, emit, onWatchdog) {
     Object.assign(this, { setup, base, emit, sram: null });
     const rp2040 = (this.rp2040 = new RP2040());
     rp2040.logger = { debug() {}, info() {}, warn() {}, error: (name, text) => { throw new Error(`${name}: ${text}`); } };
@@ -43,6 +44,7 @@ export class Chip {
       watchdog.timer.enable = false; // its alarm would fire again in the same instant
       onWatchdog();
     };
+    this.xy2 = new Xy2100(rp2040, this.clock, base, head, emit, (pin, high) => this.setPin(pin, high));
     this.bend(rp2040);
     this.gateOpen = this.logged = this.stuck = this.loopStopped = this.tickStopped = false;
     this.level = {};
@@ -55,7 +57,7 @@ export class Chip {
     this.core.SP = RAM + RAM_BYTES;
     this.hooks = new Uint8Array(RAM_BYTES / 2);
     this.at = setup.symbols;
-    for (const name of ["change_state", "outputs_set_gate"]) this.hooks[(this.at[name] - RAM) >> 1] = 1;
+    for (const name of ["change_state", "outputs_set_gate", "xy2_100_move"]) this.hooks[(this.at[name] - RAM) >> 1] = 1;
   }
 
   // Adds to the emulator what the witness sees, and the time of an SPI byte.
@@ -154,6 +156,10 @@ export class Chip {
     if (pc === this.at.change_state) {
       this.pending = { before: this.read8("state"), reason: registers[1] };
       if (registers[1] === FAULT_REASON) this.emit("fault", this.readTime(), this.read8("fault"));
+      return;
+    }
+    if (pc === this.at.xy2_100_move) {
+      this.emit("move", this.micros);
       return;
     }
     const on = (registers[0] & 0xff) !== 0;

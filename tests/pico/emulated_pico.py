@@ -1,7 +1,8 @@
 """The firmware's image for the Raspberry Pi Pico, run by rp2040js: the very UF2, with other settings if asked for.
 
 The interface is that of `EmulatedChip`. The image writes no log: a witness beside the emulator makes one of the pins,
-of the SPI words and of what the core's functions are called with. Mirrors are those that the DAC was told.
+of the SPI words and of what the core's functions are called with. Mirrors are those that the DAC was told, or the
+decoded frames of XY2-100.
 """
 
 import json
@@ -24,7 +25,7 @@ PORT = HERE.parents[1] / "firmware_protocol" / "ports" / "rp2040"
 CORE = PORT.parents[1] / "core"
 MODULES = Path(sys.prefix).parent / ".node"
 EMULATOR = MODULES / "node_modules" / "rp2040js" / "dist" / "esm" / "index.js"
-SETTINGS = struct.Struct("<3H2x3I8H12sI4H?3x")
+SETTINGS = struct.Struct("<3H2x3I8H12sI4H?B2x")
 """struct board_config of the port."""
 FIRMWARE = 0x0001_0000
 BLOCK = struct.Struct("<8I476sI")
@@ -34,6 +35,7 @@ SYMBOLS = (
     "board",
     "change_state",
     "outputs_set_gate",
+    "xy2_100_move",
     "host_serve",
     "SETTINGS",
     "data_begin",
@@ -42,6 +44,8 @@ SYMBOLS = (
 )
 INPUT_PINS = {"interlock": 10, "key": 9, "estop": 8}
 HOST_CLOSED, TRIGGER = 2, 20
+ENUMERATORS = {"analog": "INTERFACE_ANALOG", "xy2-100": "INTERFACE_XY2_100"}
+INTERFACES = tuple(ENUMERATORS)
 PULSE_US = 2
 PWM_STEPS, DUTY_FULL = 2500, 65535
 BY_POINT, BY_RESET = -1, -2
@@ -84,11 +88,15 @@ class PicoImage:
 
     mutant: number of the disabled guard
     port: folder of the sources
+    interface: of its settings, to the mirrors
     """
 
-    def __init__(self, folder, mutant=0, port=PORT):
+    def __init__(self, folder, mutant=0, port=PORT, interface="analog"):
         require_emulator()
-        build = ["make", "-s", "-C", port, f"BUILD={folder}", f"MUTANT={mutant}"]
+        self._interface = INTERFACES.index(interface)
+        settings = folder / "settings.h"
+        settings.write_text((port / "settings.h").read_text().replace("INTERFACE_ANALOG", ENUMERATORS[interface]))
+        build = ["make", "-s", "-C", port, f"BUILD={folder}", f"MUTANT={mutant}", f"SETTINGS={settings}"]
         subprocess.run(build, check=True, stdout=subprocess.DEVNULL)
         self.flash = read_uf2(folder / "board.uf2")
         self.symbols = {name: read_symbols(folder / "board.elf")[name] for name in SYMBOLS}
@@ -101,7 +109,7 @@ class PicoImage:
         limits = vars(settings.limits).values()
         uid = bytes.fromhex(settings.uid)
         sizes = settings.cell_codes, settings.queue_points, settings.cells, settings.window_pulses
-        packed = SETTINGS.pack(*limits, uid, FIRMWARE, *sizes, settings.key_edge)
+        packed = SETTINGS.pack(*limits, uid, FIRMWARE, *sizes, settings.key_edge, self._interface)
         return self.flash[:at] + packed + self.flash[at + len(packed) :]
 
 
@@ -122,6 +130,7 @@ class EmulatedPico:
         """Times at which the core commanded the edges of `pins`."""
         self.ticks_us = (0.0, 0.0)
         self.stack_bytes = (0, 0)
+        self.frames, self.frame_errors, self.moves_us = 0, [], []
         flash = image.with_settings(settings) if settings else image.flash
         setup = {"emulator": str(EMULATOR), "image": flash.hex(), "symbols": image.symbols, "offsets": image.offsets}
         setup |= {"seed": int.from_bytes(os.urandom(4)) if seed is None else seed + 1, "lateNanos": LATE_TICK_US * 1000}
@@ -212,6 +221,15 @@ class EmulatedPico:
         self._command("ticks")
         return self.ticks_us
 
+    def count_frames(self):
+        """Return the number of XY2-100 frames since power-up or reset; what is wrong with any is in `frame_errors`."""
+        self._command("frames")
+        return self.frames
+
+    def answer(self, **answer):
+        """Let the scan head answer otherwise: frame, line, bad of xy2_100.mjs."""
+        self._command("head", answer)
+
     def measure_stack(self):
         """Return the bytes of the stack that were used since power-up, and those that there are."""
         self._command("stack")
@@ -249,6 +267,16 @@ class EmulatedPico:
 
     def _on_mirrors(self, at_us, x, y):
         self.mirrors.append((at_us, x, y))
+
+    def _on_move(self, at_us):
+        self.moves_us.append(at_us)
+
+    def _on_frame_error(self, at_us, what):
+        self.frame_errors.append((at_us, what))
+
+    def _on_frames(self, count, errors):
+        assert errors == len(self.frame_errors)
+        self.frames = count
 
     def _on_dac(self, at_us, command, value):
         self.dac.append((at_us, command, value))

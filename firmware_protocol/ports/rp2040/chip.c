@@ -197,8 +197,8 @@ int16_t chip_temperature_dc(void) {
 /* --- startup --- */
 
 void chip_start(void (*on_alarm)(void)) {
-    static const uint32_t USED_BLOCKS = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 |
-                                        RESET_TIMER | RESET_UART0 | RESET_USB;
+    static const uint32_t USED_BLOCKS = RESET_ADC | RESET_DMA | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PIO0 | RESET_PWM |
+                                        RESET_SPI0 | RESET_TIMER | RESET_UART0 | RESET_USB;
     CLEAR(WATCHDOG_CTRL) = BIT(30); /* it may still run */
     alarm_callback = on_alarm;
     start_clocks();

@@ -25,7 +25,7 @@ static bool read_gate(void *context) {
 }
 static void move_mirrors(void *context, uint16_t x, uint16_t y) {
     (void)context;
-    outputs_move_mirrors(x, y);
+    outputs_move_mirrors(SETTINGS.interface, x, y);
 }
 static uint8_t read_inputs(void *context) {
     (void)context;
@@ -125,7 +125,7 @@ static bool run_loop_once(void) {
 int main(void) {
     enum reset_cause cause = chip_reset_cause();
     chip_start(on_alarm);
-    outputs_start();
+    outputs_start(SETTINGS.interface);
     chip_start_trigger(PIN_TRIGGER);
     host_start(SETTINGS.uid);
     last_tick_us = chip_now_us();

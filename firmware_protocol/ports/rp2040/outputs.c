@@ -4,6 +4,7 @@
 #include "pins.h"
 #include "registers.h"
 #include "settings.h"
+#include "xy2_100.h"
 
 #define GATE_PERIOD (CLOCK_HZ / GATE_HZ)
 /* A period of PWM has 256 steps or more, and the readback holds from one to the next: docs/how-to/wire-a-board.md. */
@@ -49,7 +50,7 @@ void outputs_set_gate(bool on, uint16_t duty) {
     REGISTER(IO_CTRL(PIN_GATE)) = IO_PWM;
 }
 
-/* --- mirrors: a DAC8563, which samples data at the clock's falling edge --- */
+/* --- mirrors: XY2-100, or a DAC8563, which samples data at the clock's falling edge --- */
 
 static void write_dac(uint8_t command, uint16_t value) {
     outputs_set(PIN_DAC_SYNC, false);
@@ -61,10 +62,13 @@ static void write_dac(uint8_t command, uint16_t value) {
     outputs_set(PIN_DAC_SYNC, true);
 }
 
-/* The second command updates both outputs. */
-void outputs_move_mirrors(uint16_t x, uint16_t y) {
+void outputs_move_mirrors(enum interface interface, uint16_t x, uint16_t y) {
+    if (interface == INTERFACE_XY2_100) {
+        xy2_100_move(x, y);
+        return;
+    }
     write_dac(0x00, x);
-    write_dac(0x11, y);
+    write_dac(0x11, y); /* updates both outputs */
 }
 
 static void start_dac(void) {
@@ -80,9 +84,17 @@ static void start_dac(void) {
     write_dac(0x30, 3); /* ignore the pin LDAC */
 }
 
+static void start_xy2_100(void) {
+    configure_input(PIN_XY2_STATUS, PAD_PULL_DOWN); /* a broken wire is a frame without control bits */
+    xy2_100_start();
+    for (uint32_t pin = PIN_XY2_CLOCK; pin <= PIN_XY2_Y; pin++) {
+        connect(pin, IO_PIO);
+    }
+}
+
 /* --- startup --- */
 
-void outputs_start(void) {
+void outputs_start(enum interface interface) {
     connect(PIN_GATE, GATE_FORCED_LOW);
     REGISTER(PWM_TOP(GATE_SLICE)) = GATE_PERIOD - 1u;
     configure_output(PIN_RELAY, false);
@@ -97,5 +109,9 @@ void outputs_start(void) {
     configure_input(PIN_HOST_RX, PAD_PULL_UP);
     REGISTER(IO_CTRL(PIN_HOST_RX)) = IO_UART;
     connect(PIN_HOST_TX, IO_UART);
-    start_dac();
+    if (interface == INTERFACE_XY2_100) {
+        start_xy2_100();
+    } else {
+        start_dac();
+    }
 }

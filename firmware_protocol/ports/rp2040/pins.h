@@ -17,6 +17,11 @@
 #define PIN_DAC_SYNC 17u
 #define PIN_DAC_CLOCK 18u
 #define PIN_DAC_DATA 19u
+#define PIN_XY2_CLOCK 16u  /* of XY2-100; the four follow each other */
+#define PIN_XY2_SYNC 17u
+#define PIN_XY2_X 18u
+#define PIN_XY2_Y 19u
+#define PIN_XY2_STATUS 21u
 #define PIN_TRIGGER 20u    /* a rising edge starts the job that awaits it */
 #define PIN_TICK 22u       /* high while the tick runs, for an oscilloscope */
 

@@ -48,6 +48,7 @@
 #define IO_UART 2u
 #define IO_PWM 4u
 #define IO_SIO 5u
+#define IO_PIO 6u
 #define IO_OUT_LOW (2u << 8) /* independent of the peripheral */
 #define PAD(pin) (PADS_BANK0 + 0x4u + 4u * (pin))
 #define PAD_SCHMITT BIT(1)
@@ -72,6 +73,29 @@
 #define SPI_DR (SPI + 0x08u)
 #define SPI_SR (SPI + 0x0cu)
 #define SPI_CPSR (SPI + 0x10u)
+
+/* --- PIO 0, DMA --- */
+#define PIO 0x50200000u
+#define PIO_CTRL PIO
+#define PIO_TX(machine) (PIO + 0x10u + 0x4u * (machine))
+#define PIO_RX(machine) (PIO + 0x20u + 0x4u * (machine))
+#define PIO_PROGRAM(k) (PIO + 0x48u + 0x4u * (k))
+#define PIO_CLOCK(machine) (PIO + 0xc8u + 0x18u * (machine))
+#define PIO_WRAP(machine) (PIO + 0xccu + 0x18u * (machine))
+#define PIO_SHIFT(machine) (PIO + 0xd0u + 0x18u * (machine))
+#define PIO_EXECUTE(machine) (PIO + 0xd8u + 0x18u * (machine))
+#define PIO_PINS(machine) (PIO + 0xdcu + 0x18u * (machine))
+#define DMA 0x50000000u
+#define DMA_READ(channel) (DMA + 0x00u + 0x40u * (channel))
+#define DMA_WRITE(channel) (DMA + 0x04u + 0x40u * (channel))
+#define DMA_COUNT(channel) (DMA + 0x08u + 0x40u * (channel))
+#define DMA_CTRL_AND_TRIGGER(channel) (DMA + 0x0cu + 0x40u * (channel))
+#define DMA_CTRL(channel) (DMA + 0x10u + 0x40u * (channel))
+#define DMA_READ_AND_TRIGGER(channel) (DMA + 0x3cu + 0x40u * (channel))
+#define DMA_ON (BIT(0) | 2u << 2) /* words of 32 bits */
+#define DMA_NEXT_READ BIT(4)
+#define DMA_PIO_RX0 4u
+#define DMA_ALWAYS 0x3fu
 
 /* --- USB: memory of both sides, controller --- */
 #define USB_DPRAM 0x50100000u

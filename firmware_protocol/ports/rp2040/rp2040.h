@@ -15,8 +15,10 @@
 /* --- clocks and resets --- */
 #define RESETS 0x4000c000u
 #define RESET_ADC BIT(0)
+#define RESET_DMA BIT(2)
 #define RESET_IO_BANK0 BIT(5)
 #define RESET_PADS_BANK0 BIT(8)
+#define RESET_PIO0 BIT(10)
 #define RESET_PLL_SYS BIT(12)
 #define RESET_PLL_USB BIT(13)
 #define RESET_PWM BIT(14)
@@ -57,6 +59,12 @@
 #define TIMER_INTERRUPTS (TIMER + 0x34u)
 #define ADC 0x4004c000u
 #define ROSC_RANDOM_BIT 0x4006001cu
+
+/* --- fields of a DMA channel's control --- */
+#define DMA_NEXT_WRITE BIT(5)
+#define DMA_WRITE_RING(bits) (BIT(10) | (bits) << 6)
+#define DMA_CHAIN(channel) ((uint32_t)(channel) << 11)
+#define DMA_REQUEST(source) ((source) << 15)
 
 /* --- interrupts --- */
 #define IO_IRQ 13u

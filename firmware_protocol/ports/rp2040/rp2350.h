@@ -6,8 +6,10 @@
 /* --- clocks and resets --- */
 #define RESETS 0x40020000u
 #define RESET_ADC BIT(0)
+#define RESET_DMA BIT(2)
 #define RESET_IO_BANK0 BIT(6)
 #define RESET_PADS_BANK0 BIT(9)
+#define RESET_PIO0 BIT(11)
 #define RESET_PLL_SYS BIT(14)
 #define RESET_PLL_USB BIT(15)
 #define RESET_PWM BIT(16)
@@ -49,6 +51,12 @@
 #define TIMER_INTERRUPTS (TIMER + 0x3cu)
 #define ADC 0x400a0000u
 #define ROSC_RANDOM_BIT 0x400e8020u
+
+/* --- fields of a DMA channel's control --- */
+#define DMA_NEXT_WRITE BIT(6)
+#define DMA_WRITE_RING(bits) (BIT(12) | (bits) << 8)
+#define DMA_CHAIN(channel) ((uint32_t)(channel) << 13)
+#define DMA_REQUEST(source) ((source) << 17)
 
 /* --- interrupts --- */
 #define IO_IRQ 21u

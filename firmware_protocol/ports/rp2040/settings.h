@@ -36,6 +36,7 @@ static const struct board_config SETTINGS = {
     .cells = BOARD_CELLS,
     .window_pulses = BOARD_PULSES,
     .key_edge = true,
+    .interface = INTERFACE_ANALOG,
 };
 
 #endif
