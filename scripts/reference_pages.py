@@ -23,7 +23,7 @@ CONFIGURATION_HEAD = f"""# Configuration
 Generated from `optodrive/device/config_sections.py` by `scripts/reference`. A configuration is one TOML file per
 display, format version {VERSION}. `optodrive config check` checks it, and `optodrive config show --json` prints it with
 every default and derived number. Quantities are in SI units, named by the suffix of the key. In brackets stand the
-value and its default.
+permitted values and the default.
 """
 TERMS_HEAD = """# Terms
 
@@ -38,7 +38,7 @@ A [parameter set](formats/parameter-sets.md) (`model.toml`) states a term as a t
 slope = { value = 0.002, unit = "1/K", source = "measured on …" }
 ```
 
-In brackets stand unit, value if the parameter is omitted, value at which a diagnosis begins its search, and range.
+In brackets stand unit, range, and the value of a parameter that may be omitted.
 `planner_terms` names the terms that heights are planned with. `simulate --truth model.toml` simulates these and every
 term that the file itself states; those of its base count only if `planner_terms` names them.
 
@@ -74,15 +74,23 @@ def format_type(schema: dict[str, Any]) -> str:
     if "const" in schema:
         return f"`{json.dumps(schema['const'])}`"
     bounds = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-    limits = " and ".join(f"{sign} {schema[key]:g}" for key, sign in bounds.items() if key in schema)
-    return " ".join(part for part in (schema.get("type", "value"), limits) if part)
+    if "minimum" in schema and "maximum" in schema:
+        limits = f"{schema['minimum']:g} to {schema['maximum']:g}"
+    else:
+        limits = " and ".join(f"{sign} {schema[key]:g}" for key, sign in bounds.items() if key in schema)
+    kind = schema.get("type", "value")
+    return " ".join(part for part in ("" if kind == "number" and limits else kind, limits) if part)
 
 
 def format_default(info: FieldInfo) -> str:
     """Return a field's default as TOML, or the meaning of its absence."""
     if info.default is PydanticUndefined:
         return "required"
-    return "none" if info.default is None else f"`{info.default!r}`".replace("'", '"').replace("True", "true")
+    return (
+        "none"
+        if info.default is None
+        else f"`{info.default!r}`".replace("'", '"').replace("True", "true").replace("False", "false")
+    )
 
 
 def build_configuration_reference() -> str:
@@ -108,8 +116,8 @@ def build_terms_reference() -> str:
         about = describe_term(term)
         rows: dict[str, list[str]] = {}
         for item in about["parameters"]:
-            omitted = "required" if item["if_omitted"] is None else f"{item['if_omitted']:g}"
-            values = f"{item['unit']}; {omitted}; {item['start']:g}; {item['low']:g} to {item['high']:g}"
+            omitted = "" if item["if_omitted"] is None else f"; {item['if_omitted']:g}"
+            values = f"{item['unit']}; {item['low']:g} to {item['high']:g}{omitted}"
             rows.setdefault(f"({values}): {item['source']}", []).append(f"`{item['name']}`")
         notes = [f"Needs {', '.join(f'`{name}`' for name in term.requires)}."] if term.requires else []
         if not term.in_pixel:

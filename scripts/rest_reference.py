@@ -17,7 +17,8 @@ from optodrive.planning.display_model import DisplayModel
 HEAD = """# REST API
 
 Generated from the daemon's [OpenAPI document](openapi.json), which the daemon serves at `/openapi.json`. Every route
-except `/v1/health` needs `Authorization: Bearer TOKEN`; the role is the lowest that may call the route.
+except `/v1/health` needs `Authorization: Bearer TOKEN`. Below each stand the lowest role that may call it and, after an
+arrow, what it answers with 200.
 [frames.json](formats/frames-json.md) describes the body of a push, [streaming](../how-to/stream-frames.md) the
 WebSocket, [the client](../how-to/use-the-python-client.md) the use from Python.
 
@@ -28,12 +29,27 @@ PROBLEMS_HEAD = """Every route may send these statuses with a [Problem](#problem
 """
 MODELS_HEAD = """## Models
 
-The JSON bodies: each member with its type and meaning. A type in parentheses may be null. Members of `Problem`,
+The JSON bodies: each member with its type and meaning. A member with `?` may be null. One without a type is a number if
+its name ends in a unit, a boolean if its meaning begins with "whether", else a string. Members of `Problem`,
 `FrameResult` and `HoldReport` that do not apply are absent; all other models always have all members.
 """
 
 SAYS_NOTHING = re.compile(r"(of|its|their)( (the|its|each|a))?( \w+)?")
 """A meaning that repeats the name of member and model, such as "of the pulse"."""
+UNITS = {
+    "s": "s",
+    "ms": "ms",
+    "us": "µs",
+    "m": "m",
+    "um": "µm",
+    "w": "W",
+    "j": "J",
+    "k": "K",
+    "c": "°C",
+    "hz": "Hz",
+    "ppm": "ppm",
+}
+"""Units by the end of a name."""
 
 
 def build_openapi():
@@ -82,9 +98,11 @@ def format_route(title, route, stated):
     for status, response in responses:
         if status < "300":
             bodies.setdefault(format_content(response), []).append(status)
-    returns = "; ".join(f"{' or '.join(statuses)} {body}" for body, statuses in bodies.items())
+    returns = "; ".join(
+        body if statuses == ["200"] else f"{' or '.join(statuses)} {body}" for body, statuses in bodies.items()
+    )
     lines = [f"## {title}", "", route.get("description", ""), ""]
-    lines += [f"Role: {route['x-min-role'] or 'none'}. Response: {returns}.", ""]
+    lines += [f"{route['x-min-role'] or 'no role'} → {returns}", ""]
     if "requestBody" in route:
         body = route["requestBody"]
         lines += [f"Body: {format_type(body['content']['application/json']['schema'])}, {body['description']}.", ""]
@@ -133,17 +151,28 @@ def format_model(name, schema, configured):
     rest = [(member,) for member in members if member not in stated]
     rows = []
     for group in sorted([*meanings, *rest], key=lambda group: list(members).index(group[0])):
-        kinds = list(dict.fromkeys(members[member] for member in group))
-        labels = (
-            [f"`{member}` {members[member]}" for member in group]
-            if len(kinds) > 1
-            else [", ".join(f"`{member}`" for member in group) + f" {kinds[0]}"]
-        )
-        meaning = meanings.get(group, "")
-        rows.append(
-            f"- {', '.join(labels)}" + (f": {meaning}" if meaning and not SAYS_NOTHING.fullmatch(meaning) else "")
-        )
+        rows.append(format_members({member: members[member] for member in group}, meanings.get(group, "")))
     return "\n".join([*lines, *rows, ""] if rows else lines)
+
+
+def format_members(kinds, meaning):
+    """Format members that share a meaning. Types, units and nulls that the names or `?` state are left out."""
+    labels, stated, is_evident = [], "", True
+    for name, kind in reversed(kinds.items()):
+        unit = UNITS.get(name.rpartition("_")[2])
+        is_null = kind.startswith("(") and kind.endswith(")")
+        bare = kind[1:-1] if is_null else kind
+        if (
+            bare != "string"
+            and (bare, unit is None) != ("number", False)
+            and (bare, meaning[:7]) != ("boolean", "whether")
+        ):
+            is_evident = False
+        labels.insert(0, f"`{name}`{'?' if is_null else ''}" + ("" if is_evident or bare == stated else f" {bare}"))
+        stated = bare
+        meaning = re.sub(rf", {unit}(?=,|;|$)", "", meaning) if unit else meaning
+    meaning = re.sub(r", null (without (one|any|it)|otherwise)$", "", meaning)
+    return f"- {', '.join(labels)}" + (f": {meaning}" if meaning and not SAYS_NOTHING.fullmatch(meaning) else "")
 
 
 def read_meanings(description, members):
@@ -183,7 +212,8 @@ def format_type(schema, configured=frozenset()):
     if schema.get("type") == "array":
         if "prefixItems" in schema:
             return f"[{', '.join(format_type(item) for item in schema['prefixItems'])}]"
-        return f"list of {format_type(schema['items'])}"
+        kind = format_type(schema["items"])
+        return f"{kind}[]" if " " not in kind else f"list of {kind}"
     if schema.get("type") == "object" and isinstance(schema.get("additionalProperties"), dict):
         return f"map of {format_type(schema['additionalProperties'])}"
     return schema.get("type", "any")
