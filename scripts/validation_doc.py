@@ -17,25 +17,23 @@ INTRODUCTION = """\
 # Validation
 
 This page compares the models with the paper. `scripts/validation-doc` generates it; `optodrive validate` prints the
-same rows, and those of the inputs that the models take from the paper. [The paper's facts](../reference/paper-facts.md)
-says what each row is.
+same rows, and those of the inputs. [The paper's facts](../reference/paper-facts.md) says what each row is.
 
 `literal` is the set `paper_s1_literal`, Text S1 without any fit. `calibrated` drives the displays; it is
 fitted by `scripts/calibrate-parameters` to three facts, one per parameter: κ to `z_peak_w020`, τ_g to
 `dpp_200Hz`, φ to `F_peak_w020`. `eta_stroke` follows from two of them and counts as fitted. All other rows are
 predictions. `extended` is the model with terms, fitted by `scripts/calibrate-extended` to the same facts and the
-temperature of the same pixel; [extended-model.md](extended-model.md) states what each term gains.
+temperature of the same pixel ([extended model](extended-model.md)).
 
 - Full power is 2.45 W, the reading of the bolometer, also where a figure says 2.5 W.
 - The ratio is model over measured, of temperatures by their rises above 20 °C; an upper bound has none.
-- No power is given for `dpp_200Hz` and `z_tp8_w040`: both are evaluated at full power. τ_g depends on it; 10 % less for
-  the ripple would make it 2.6 ms instead of 3.0.
+- No power is given for `dpp_200Hz` and `z_tp8_w040`: both are evaluated at full power. With 10 % less for the ripple
+  τ_g would be 2.6 ms instead of 3.0.
 - `N_50um` alone would require τ_g = 17 ms. It contradicts the other displacements at every width, so neither the fit
   nor the uncertainty of τ_g includes it.
 - `F_linear_in_P` and `z_repeat_w040` hold by construction: the model is linear and has no memory beyond 5 s.
 - The paper fitted R and C to the first 30 ms of the temperatures that are predicted here at 50 ms.
-- The extended set derives the gas's rise from its force, by the gas law on the whole aperture, as the paper did; the
-  other two state their own gas.
+- The extended set derives the gas's rise from its force, by the gas law on the whole aperture, as the paper did.
 - That the gas settles at half the absorber's rise is an assumption of Text S1; displacements determine only its product
   with κ.
 """
@@ -44,10 +42,9 @@ LITERAL_SECTION = """\
 ## Results of the literal set
 
 Its gas lags by 64 ms. This halves the displacement of a 50 ms pulse and reduces that of an 8 ms pulse to a quarter and
-the 200 Hz ripple to a twentieth, although its κ, 3.9 µm/K, is within 3 % of the fitted one. That agreement is a
-coincidence: its formula has 3/1280 where a clamped plate has 3/16, and uses the pressure at constant volume under a
-membrane that rises by a millimetre. Its φ is ten times the fitted one: the force did not act on the whole aperture at
-constant volume.
+the 200 Hz ripple to a twentieth. Its κ, 3.9 µm/K, is within 3 % of the fitted one by coincidence: its formula has
+3/1280 where a clamped plate has 3/16, and uses the pressure at constant volume under a membrane that rises by a
+millimetre. Its φ is ten times the fitted one.
 
 The two laws of Fig. 3D belong to opposite limits. In a linear pixel without lag the ripple follows 1 − exp(−t_g/τ) for
 pulses much longer than τ, and the mean follows τ/t_g for pulses much shorter; at t_p = t_g = τ it gives 0.73 and 0.79.
@@ -56,31 +53,26 @@ pulses much longer than τ, and the mean follows τ/t_g for pulses much shorter;
 DIAGNOSIS_SECTION = """\
 ## Results of `optodrive validate --diagnose`
 
-The command treats the twelve measured outcomes as a recording and the literal set as the model, weighs sets of the
-causes of `optodrive/lab/validation/causes.py`, and repeats selection and fit without each group of facts to
-predict that group. A cause is named on the conditions of [diagnoses](../decisions/0082-four-conditions-of-a-cause.md).
-Aggregate figures permit less than a recording does: there are no repeats, so the noise is an assumption; a group that
-alone shows a cause is held out fact by fact; what one fact shows, nothing tests. It prints:
+The command treats the twelve measured outcomes as a recording and the literal set as the model. It weighs sets of
+causes, and repeats selection and fit without each group of facts to predict that group. A cause is named as in a
+[diagnosis](diagnosis.md). There are no repeats, so the noise is an assumption; what one fact shows, nothing tests. It
+begins:
 """
 
 DISCUSSION_SECTION = """\
-Interpretation:
-
 - The lag is certain: displacements and vibration each predict the other, with causes found without them.
-- So is the error of the force, but not its reason. A smaller area and a compliant load cell are nearly the same line
+- So is the error of the force, but not its reason: a smaller area and a compliant load cell are nearly the same line
   through two numbers. Without any force the extended model is worse than the literal one, because its gas is correctly
   warmer: two errors had compensated each other.
 - No fit can tell that the membrane is not a plate and the gas not at constant volume. The two errors cancel in
-  Text S1's displacement per kelvin, so a fit has nothing to correct. Volume and force reveal them by arithmetic.
+  Text S1's displacement per kelvin. Volume and force reveal them by arithmetic.
 - A dead time of 2.3 ms makes 50 µm at 217 pixels per second agree with everything else, and 400 µm at 26.5 as well. It
-  depends on the first; the second agrees but does not require it. The paper mentions pulse times only, and small steps
-  of inexpensive mirrors take 0.3 to 0.5 ms. The dead time is therefore the meaning of that number, not a finding.
+  depends on the first number. The paper mentions pulse times only, so the dead
+  time is the meaning of that number, not a finding.
 - χ² is below the degrees of freedom: errors of 11 % are wide for these facts. With 2 to 15 % between samples
   instead of 10 % the same causes are named; with 25 % the dead time is not.
 - Facts of one paper share samples and instruments. The gain shows that few causes explain many numbers, not how another
   display behaves.
-
-A rate is compared as the height in the time that it leaves per pixel: near the plateau 7 % of height is 24 % of time.
 """
 
 FACTS_INTRODUCTION = """\
@@ -152,17 +144,15 @@ def build_diagnosis_section():
         DIAGNOSIS_SECTION,
         format_quote(keep_findings(narrative.describe_findings(study_result))),
         "".join("| " + " | ".join(line) + " |\n" for line in lines),
-        format_quote(
-            [*narrative.describe_predictions(study_result), "", *narrative.describe_assumptions(study_result)]
-        ),
+        "".join(f"{line}\n" for line in narrative.describe_predictions(study_result) if "error factor" in line),
         DISCUSSION_SECTION,
     ]
     return "\n".join(parts)
 
 
 def keep_findings(lines):
-    """Return the lines on the named causes and the contradictions, without those on all other causes."""
-    others = next((k for k, line in enumerate(lines) if line.startswith("Other causes")), len(lines))
+    """Return the lines on the named causes, without those on the assumptions and on all other causes."""
+    others = next((k for k, line in enumerate(lines) if line.startswith(("Assumptions", "Other causes"))), len(lines))
     return [*lines[:others], "…"]
 
 
@@ -178,8 +168,11 @@ def format_table(rows):
 
 
 def format_bullets(items):
-    """Return one bullet per named remark."""
-    return "".join(f"- `{name}`: {text}\n" for name, text in items)
+    """Return one bullet per remark, with all names that it has."""
+    names = {}
+    for name, text in items:
+        names.setdefault(text, []).append(f"`{name}`")
+    return "".join(f"- {', '.join(named)}: {text}\n" for text, named in names.items())
 
 
 def describe_fact(fact):
