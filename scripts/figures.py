@@ -19,17 +19,18 @@ from measuring import ROOT, format_number
 PAGE = ROOT / "docs" / "reference" / "benchmarks.md"
 BEGIN, END = "<!-- scripts/figures -->", "<!-- end -->"
 SHOWN = {
-    "plan": r"^(50|400) µm|whole",
-    "start": r".",
-    "limit": r"full frame|1,000,000|after all",
+    "plan": r"^50 µm: pulses|^400 µm: pulses limited|shown per second|whole",
+    "start": r"pass|stop|status|plan`|start to end",
+    "limit": r"400 µm: full frame|1,000,000|after all",
     "wire": r".",
-    "board": r".",
+    "board": r"simulated board",
     "hour": r"one hour|over kernel|difference",
     "order": r"(full|50 at random|braille).*(second, (naive|sched)|bound, sched|fraction by)|experiment-6.*scheduler",
-    "field": r"worst geometry|two sigma|positions to codes",
-    "page": r".",
-    "memory": r"all processes|first answer",
-    "stream": r"^(?!.*truncates).*(first|round trip|, limited|shown per second of (20|60|200)|underruns)",
+    "field": r"(289|25) spots: rms.*worst geometry|289 spots.*two sigma|positions to codes",
+    "page": r"all heights|frames per second|executed|underruns",
+    "memory": r"at rest|first answer",
+    "stream": r"^(?!.*truncates).*(first light|^(WebSocket: )?arrival to first byte|^round trip.*bare|"
+    r"frame of (200|1511).*, limited|shown per second of (20|60|200)|underruns)",
     "stop": r".",
     "fingers": r"dots under|first light",
 }

@@ -144,8 +144,8 @@ CAPS = (
         is_per_pixel=False,
     ),
     Cap(
-        # A cap and not a factor on targets: trimmed, refused and proven on the bytes by the code of every other cap
-        # (decision 36).
+        # A cap and not a factor on targets: trimmed, refused and proven on the bytes by the code of every other cap.
+        # Not a share per caller: light adds up.
         key="dim",
         label="dimmed power",
         message="dim cap",
