@@ -4,6 +4,9 @@ Theory of operation. A discovery ends in a formula. The pixel gets its values at
 data covered, and takes them linearly between these and constant beyond: so no formula is evaluated where nothing was
 measured, kernels know one shape only, and no value anywhere, tails included, is larger or smaller than those of knots.
 
+Range. What a function is beyond its ends nobody knows. A plan during which a pixel goes there is refused
+(`check_reached`), by the states that heights are planned with, so that only what the bound adds ever meets a tail.
+
 Bound. A file may hold any table, so nothing is assumed of one but what is computed from all of its knots
 (`_find_extremes`) or refused. With R the largest resistance of a bridge, f the function, u the absorber's rise over its
 wall and v the one that the limiter computes without the term, which never falls faster nor rises more slowly:
@@ -67,8 +70,8 @@ MAX_SLOTS = 4
 HEAD = 4
 SLOT = HEAD + KNOTS
 """A slot's numbers: place, quantity, low end and distance of the knots; then the values."""
-MEMORY_TIME = MAX_SLOTS * SLOT
-"""Column of the memory's time constant, s, 0 without a memory."""
+MEMORY_TIME, MAX_POWER = MAX_SLOTS * SLOT, MAX_SLOTS * SLOT + 1
+"""Columns of the memory's time constant, s, and of the largest power of the data, W, 0 where there is none."""
 NOWHERE, LIGHT, HEAT_CAPACITY, HEAT_FLOW, GAS_RATE, DISPLACEMENT, FORCE = range(7)
 OF_ABSORBER, OF_GAS, OF_MEMORY, OF_DRIVE, OF_POWER, OF_TIME = range(6)
 PLACES = ("", "light", "heat_capacity", "absorber", "gas", "displacement", "force")
@@ -98,6 +101,8 @@ MIN_SPAN = 1e-3
 """Smallest plausible distance of a table's ends, in the quantity's unit."""
 LARGEST = {"light": 10.0, "heat_capacity": 10.0, "absorber": 10.0, "gas": 1e6, "displacement": 0.01, "force": 1.0}
 """Largest plausible value in each place, in the unit of `UNITS`; of light by its power in W."""
+RANGE_SHARE = 0.01
+"""Share of a range by which a pixel may leave it: as far as two integrators, and maxima between steps, differ."""
 ZERO_SHARE = 1e-9
 """Share of the largest plausible value that counts as 0: of a heat flow 10 nW, or some microkelvin."""
 
@@ -107,9 +112,10 @@ class DiscoveredTerm(Section):
 
     where: key of `UNITS`; depends_on: rises of absorber, gas or memory, K, over the wall for a heat flow, the drive of
     the gas, half the absorber's rise less the gas's, K, the incident power, W, or the time since the gate has opened,
-    s; values: of the function at 65 equal distances from low to high, constant beyond; light: relative to the power, on
-    the power itself in W; heat_capacity: f in C / (1 + f); memory_time_s: time constant with which the memory follows
-    the absorber's rise over its wall
+    s; low, high: range of the data; values: of the function at 65 equal distances from low to high, constant beyond;
+    light: relative to the power, on the power itself in W; heat_capacity: f in C / (1 + f); memory_time_s: time
+    constant with which the memory follows the absorber's rise over its wall; max_power_w: largest incident power of the
+    data, if stated
     """
 
     where: Literal["light", "heat_capacity", "absorber", "gas", "displacement", "force"]
@@ -120,6 +126,7 @@ class DiscoveredTerm(Section):
     high: float
     values: tuple[float, ...]
     memory_time_s: Annotated[float, Field(gt=SHORTEST_S, le=10.0)] | None = None
+    max_power_w: Annotated[float, Field(gt=0.0, le=RANGES["power"][1])] | None = None
     source: str
 
     @model_validator(mode="after")
@@ -207,30 +214,80 @@ def check_set(terms: Sequence[DiscoveredTerm], where: str, c_j_per_k: float) -> 
 
 def list_values(terms: Sequence[DiscoveredTerm]) -> dict[str, float]:
     """Return the numbers of the term by the columns of its row that are not zero."""
-    row = np.zeros(MEMORY_TIME + 1)
+    row = np.zeros(MAX_POWER + 1)
     for slot, term in enumerate(terms):
         head = (PLACES.index(term.where), QUANTITIES.index(term.depends_on), term.low)
         row[slot * SLOT : (slot + 1) * SLOT] = (*head, (term.high - term.low) / (KNOTS - 1), *term.values)
         row[MEMORY_TIME] = term.memory_time_s or row[MEMORY_TIME]
+    row[MAX_POWER] = min((term.max_power_w for term in terms if term.max_power_w is not None), default=0.0)
     return {str(column): float(row[column]) for column in np.flatnonzero(row)}
+
+
+def build_unreached(pixels: int) -> FloatArray:
+    """Return extremes of pixels without any pulse: [pixels, functions and the power, 2]."""
+    return np.stack([np.full((pixels, MAX_SLOTS + 1), inf), np.full((pixels, MAX_SLOTS + 1), -inf)], axis=2)
+
+
+def check_reached(values: TermValues, reached: FloatArray) -> None:
+    """Raise InputError for the pixel that goes furthest beyond the data of a function.
+
+    values: as of `list_values`; reached: extremes, as of `build_unreached`
+    """
+    row = Discovered().pack(values)
+    slots = row[: MAX_SLOTS * SLOT].reshape(MAX_SLOTS, SLOT)
+    low = np.append(slots[:, 2], 0.0)
+    high = np.append(slots[:, 2] + (KNOTS - 1) * slots[:, 3], row[MAX_POWER])
+    beyond = np.maximum(low - reached[:, :, 0], reached[:, :, 1] - high)
+    is_used = high > low  # neither an empty slot nor an unstated power
+    beyond[:, is_used] /= (high - low)[is_used]
+    beyond[:, ~is_used] = -inf
+    pixel, number = (int(each) for each in np.unravel_index(np.argmax(beyond), beyond.shape))
+    if not beyond[pixel, number] > RANGE_SHARE:
+        return
+    quantity, what = "power", "discovered terms"
+    if number < MAX_SLOTS:
+        quantity, what = QUANTITIES[int(slots[number, 1])], f"the discovered term in {PLACES[int(slots[number, 0])]}"
+    unit = RANGES.get(quantity, RISES)[2]
+    is_high = reached[pixel, number, 1] - high[number] > low[number] - reached[pixel, number, 0]
+    ends = " to ".join(format_quantity(float(end), unit) for end in (low[number], high[number]))
+    raise InputError(
+        f"pixel {pixel}: {quantity} of {what}",
+        Unquoted(format_quantity(float(reached[pixel, number, int(is_high)]), unit, 4)),
+        f"{ends}, the range of its data, outside of which nothing is known of it",
+        code="untested",
+    )
+
+
+@kernel
+def _read_quantity(v: FloatArray, slot: int, y: FloatArray, s: int, c: FloatArray) -> float:
+    """Return the quantity that the function of a slot depends on."""
+    quantity, wall_k = int(v[slot + 1]), c[FAR_END_K] if v[slot] == HEAT_FLOW else 0.0
+    if quantity == OF_ABSORBER:
+        return float(y[ABSORBER] - wall_k)
+    if quantity == OF_GAS:
+        return float(y[GAS] - wall_k)
+    if quantity == OF_MEMORY:
+        return float(y[s])
+    if quantity == OF_DRIVE:
+        return float(0.5 * y[ABSORBER] - y[GAS])
+    return float(c[POWER_W] if quantity == OF_POWER else c[SINCE_EDGE_S])
+
+
+@kernel
+def note_reached(v: FloatArray, y: FloatArray, s: int, c: FloatArray, low: FloatArray, high: FloatArray) -> None:
+    """Lower and raise the extremes of each function's quantity, and, behind these, of the power, to those here."""
+    for number in range(MAX_SLOTS):
+        place = v[number * SLOT]
+        if place != NOWHERE and (place != LIGHT or c[POWER_W] > 0.0):
+            z = _read_quantity(v, number * SLOT, y, s, c)
+            low[number], high[number] = min(low[number], z), max(high[number], z)
+    high[MAX_SLOTS] = max(high[MAX_SLOTS], c[POWER_W])
 
 
 @kernel
 def _evaluate(v: FloatArray, slot: int, y: FloatArray, s: int, c: FloatArray) -> float:
     """Return the function of a slot at the present states."""
-    quantity, wall_k = int(v[slot + 1]), c[FAR_END_K] if v[slot] == HEAT_FLOW else 0.0
-    if quantity == OF_ABSORBER:
-        z = y[ABSORBER] - wall_k
-    elif quantity == OF_GAS:
-        z = y[GAS] - wall_k
-    elif quantity == OF_MEMORY:
-        z = y[s]
-    elif quantity == OF_DRIVE:
-        z = 0.5 * y[ABSORBER] - y[GAS]
-    elif quantity == OF_POWER:
-        z = c[POWER_W]
-    else:
-        z = c[SINCE_EDGE_S]
+    z = _read_quantity(v, slot, y, s, c)
     place = (z - v[slot + 2]) / v[slot + 3]
     # Constant beyond the ends. `not >`: NaN takes the low end and cannot index the table.
     if not place > 0.0:
@@ -300,7 +357,7 @@ class Discovered(Term):
     key = KEY
     label = "a term that was discovered"
     followers = ("memory_k",)
-    row_length = MEMORY_TIME + 1
+    row_length = MAX_POWER + 1
     is_fast = True
     kernels = Kernels(
         optical_power=optical_power,

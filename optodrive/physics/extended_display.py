@@ -9,10 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.core.errors import InputError
 from optodrive.core.kernels import array_kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
 from optodrive.device.panel import Neighbours
+from optodrive.physics.discovered_term import KEY as DISCOVERED
+from optodrive.physics.discovered_term import build_unreached, check_reached
 from optodrive.physics.extended_pulse_for_height import find_shortest_pulse
 from optodrive.physics.extended_pulses import (
     DISPLACEMENT_SIGNAL,
@@ -139,6 +142,7 @@ class ExtendedThermalState:
         self._context[DOSE] = self._context[SESSION_TIME] = 1.0  # as at the end of the recording
         columns = np.stack([getattr(pixels, name) for name in Pixel._fields], axis=1)
         self._events = EventStates.cold(columns, at_s)
+        self._reached = build_unreached(len(pixels) if DISCOVERED in values else 0)
         self._snapshot_cache: SnapshotCache | None = None
 
     def copy(self) -> "ExtendedThermalState":
@@ -150,6 +154,7 @@ class ExtendedThermalState:
         twin = ExtendedThermalState.__new__(ExtendedThermalState)
         vars(twin).update(vars(self))
         twin._events = self._events.copy_shifted(offset_s)
+        twin._reached = build_unreached(len(self._reached))
         # A cache is of the events that it was computed from.
         twin._snapshot_cache = None
         return twin
@@ -173,13 +178,14 @@ class ExtendedThermalState:
         last = np.full(len(self.pixels), -1)
         for begin in range(0, len(pixel), BATCH):
             end = min(begin + BATCH, len(pixel))
-            done = apply_pulses(*display, *columns, *peaks, last, begin, end)
+            done = apply_pulses(*display, *columns, *peaks, last, self._reached, begin, end)
             if done < end:
                 raise self._time_order_error(int(pixel[done]), float(start_s[done]))
             on_progress()
         for begin in range(0, len(self.pixels), BATCH):
             end = min(begin + BATCH, len(self.pixels))
-            add_peaks_after_off(self._events, self._active, self._context, last, begin, end, peaks.displacement_m)
+            after = (last, self._reached, begin, end, peaks.displacement_m)
+            add_peaks_after_off(self._events, self._active, self._context, *after)
             on_progress()
         return peaks
 
@@ -208,20 +214,45 @@ class ExtendedThermalState:
         )
         return (periods, duty) if periods else None
 
+    def check_tested(self) -> None:
+        """See `ThermalState.check_tested`."""
+        if len(self._reached):
+            check_reached(self._values[DISCOVERED], self._reached)
+
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
-        """Return the largest displacement that one pulse can reach on each cold pixel, m, [p]."""
+        """Return the largest displacement that one pulse can reach on each cold pixel, m, [p].
+
+        No pulse that leaves the range of the data of a discovered function counts.
+        """
         affected = {all_terms()[key].affected_pixel(values) for key, values in self._values.items()}
         # Equal pixels are computed once: of 1,511 only those that a term singles out differ.
         kinds = [(pixel, index if index in affected else None) for index, pixel in enumerate(self.pixels.elements)]
-        width_s = drive.max_periods * drive.period_s
         by_kind: dict[tuple[Pixel, int | None], float] = {}
         for index, kind in enumerate(kinds):
             if kind not in by_kind:
-                cold = self.copy_shifted(0.0)
-                cold._events = EventStates.cold(self._events.columns, 0.0)
-                one = (np.array([index]), np.zeros(1), np.array([width_s]), np.array([drive.max_power_w]))
-                by_kind[kind] = float(cold.apply_pulses(*one).displacement_m[0])
+                by_kind[kind] = self._compute_max_m(index, drive)
         return np.array([by_kind[kind] for kind in kinds])
+
+    def _compute_max_m(self, pixel: int, drive: DriveRange) -> float:
+        """Return the displacement, m, of the longest pulse on a cold pixel that stays within the range of the data.
+
+        If none does, as at too large a power, that of the longest of all, whose plan is refused by what is wrong.
+        """
+        reached_m, short, long = 0.0, 0, drive.max_periods + 1  # known to stay within, and not to
+        longest_m, periods = 0.0, drive.max_periods
+        while long - short > 1:
+            cold = self.copy_shifted(0.0)
+            cold._events = EventStates.cold(self._events.columns, 0.0)
+            one = (np.array([pixel]), np.zeros(1), np.array([periods * drive.period_s]), np.array([drive.max_power_w]))
+            peak_m = float(cold.apply_pulses(*one).displacement_m[0])
+            longest_m = max(longest_m, peak_m)
+            try:
+                cold.check_tested()
+                reached_m, short = peak_m, periods
+            except InputError:
+                long = periods
+            periods = (short + long) // 2
+        return reached_m or longest_m
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
         """See `ThermalState.simulate_displacement_m`."""

@@ -9,16 +9,22 @@ import numpy as np
 
 from optodrive.core.kernels import array_kernel, kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.physics.discovered_term import KEY as DISCOVERED
+from optodrive.physics.discovered_term import note_reached
 from optodrive.physics.nominal_display import TIME_ROUNDING_S, pixel_at
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, interpolate_states, next_step_s, output_signal, step
 from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, PANEL_HELD, POWER_W
-from optodrive.physics.term_kernels import STATE_COUNT
+from optodrive.physics.term_kernels import FOLLOWER_ROW, STATE_COUNT, TERM_ROW
 
 DISPLACEMENT_SIGNAL = 1
 """Number of the signal in `pixel_ode.output_signal`."""
 DECAYED_SHARE, DECAYED_TIME_CONSTANTS = 0.7, 8.0
 """The peak after gate off is over once the displacement is below this share of it, after this many gas lags."""
+DISCOVERED_ROW = TERM_ROW[DISCOVERED]
+MEMORY_ROW = FOLLOWER_ROW[DISCOVERED_ROW]
+LOW, HIGH = 8, 9
+"""Rows of a work space, if it has them, for the extremes of what discovered functions depend on."""
 COLD_K = 1e-6
 """Largest rise of a pixel that counts as cold."""
 
@@ -63,7 +69,8 @@ def advance_states(
 ) -> tuple[float, float]:
     """Advance the states work[0] by duration_s at the context's power. Return the peaks meanwhile.
 
-    since_edge_s: time since the last gate edge. The peaks are those of displacement, m, and absorber rise, K.
+    since_edge_s: time since the last gate edge. The peaks are those of displacement, m, and absorber rise, K. A work
+    space of ten rows notes what discovered functions depend on.
     """
     peak_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
     peak_k = work[0, ABSORBER]
@@ -86,6 +93,9 @@ def advance_states(
         middle_m = output_signal(pixel, active, work[7], c, DISPLACEMENT_SIGNAL)
         peak_m = max(peak_m, end_m, _vertex_m(begin_m, middle_m, end_m))
         peak_k = max(peak_k, work[2, ABSORBER])
+        if work.shape[0] > HIGH:
+            for row in (7, 2):
+                note_reached(active.values[DISCOVERED_ROW], work[row], MEMORY_ROW, c, work[LOW], work[HIGH])
         copy_states(work[2], work[0])
         copy_states(work[3], work[1])
         after_edge = False
@@ -189,10 +199,30 @@ def _store(events: EventStates, work: FloatArray, i: int, at_s: float, off_s: fl
 
 
 @kernel
+def _store_reached(work: FloatArray, i: int, reached: FloatArray) -> None:
+    """Add the extremes of a work space to those of pixel i, and begin anew."""
+    if work.shape[0] > HIGH:
+        for number in range(reached.shape[1]):
+            reached[i, number, 0] = min(reached[i, number, 0], work[LOW, number])
+            reached[i, number, 1] = max(reached[i, number, 1], work[HIGH, number])
+        work[LOW] = np.inf
+        work[HIGH] = -np.inf
+
+
+@kernel
 def _raise_peak(peak_m: FloatArray, last_pulse: IntArray, i: int, displacement_m: float) -> None:
     """Raise the peak of the last pulse on pixel i, if it had one, to a displacement."""
     if last_pulse[i] >= 0:
         peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], displacement_m)
+
+
+@array_kernel
+def _allocate(count: int, reached: FloatArray) -> FloatArray:
+    """Return a work space for states [count], of ten rows if extremes are noted of any pixel."""
+    work = np.zeros((HIGH + 1 if len(reached) else LOW, count))
+    work[LOW:] = np.inf
+    work[HIGH:] = -np.inf
+    return work
 
 
 @array_kernel
@@ -208,16 +238,17 @@ def apply_pulses(
     peak_m: FloatArray,
     peak_k: FloatArray,
     last_pulse: IntArray,
+    reached: FloatArray,
     begin: int,
     end: int,
 ) -> int:
     """Apply the pulses begin to end and fill in their peaks [n]. Return the first that is out of order, or end.
 
     neighbours: [p, k] pixels that the light on a pixel also heats, −1 for none; last_pulse: [p] row of each pixel's
-    last pulse so far, −1 for none
+    last pulse so far, −1 for none; reached: as of `build_unreached`, of no pixel without discovered functions
     """
     count = events.states.shape[1]
-    work, shared, dark, c = np.zeros((8, count)), np.zeros((8, count)), np.zeros(count), context.copy()
+    work, shared, dark, c = _allocate(count, reached), np.zeros((8, count)), np.zeros(count), context.copy()
     for row in range(begin, end):
         for side in range(-1, neighbours.shape[1]):
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
@@ -238,6 +269,7 @@ def apply_pulses(
                 copy_rows(active.laser_rows, dark, work[0])
                 wait_s = max(0.0, start_s[row] - events.at_s[i])
                 _store(events, work, i, events.at_s[i] + wait_s, events.off_s[i] + wait_s)
+                _store_reached(work, i, reached)
         for side in range(-1, neighbours.shape[1]):
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
             if i < 0:
@@ -255,6 +287,7 @@ def apply_pulses(
                 peak_k[row] = max(before_k, on_peak_k)
             _raise_peak(peak_m, last_pulse, i, on_peak_m)
             _store(events, work, i, start_s[row] + width_s[row], 0.0)
+            _store_reached(work, i, reached)
         # After all neighbours: until then the light was where it was before.
         events.illuminated[0] = pixel[row]
         copy_rows(active.laser_rows, events.states[pixel[row]], events.states[len(events.columns)])
@@ -269,18 +302,20 @@ def add_peaks_after_off(
     active: ActiveTerms,
     context: FloatArray,
     last_pulse: IntArray,
+    reached: FloatArray,
     begin: int,
     end: int,
     peak_m: FloatArray,
 ) -> None:
     """Raise the peaks of the last pulses of the pixels begin to end to those that follow after gate off."""
-    work, c = np.zeros((8, events.states.shape[1])), context.copy()
+    work, c = _allocate(events.states.shape[1], reached), context.copy()
     for i in range(begin, end):
         if last_pulse[i] >= 0:
             copy_states(events.states[i], work[0])
             set_light(c, i, events.illuminated[0])
             off_peak_m = peak_after_off_m(pixel_at(events.columns, i), active, c, work, 0.0, 0.0)
             _raise_peak(peak_m, last_pulse, i, off_peak_m)
+            _store_reached(work, i, reached)
 
 
 @array_kernel

@@ -121,6 +121,9 @@ class NominalThermalState:
             raise self.build_time_order_error(int(pixel[done]), float(start_s[done]))
         return peaks
 
+    def check_tested(self) -> None:
+        """See `ThermalState.check_tested`. The nominal pixel has no such function."""
+
     def solve_pulse(
         self,
         pixel: int,

@@ -179,6 +179,9 @@ def load_parameters(name: str | Path) -> ParameterSet:
     check_requirements(f"{path}: terms", parameters.terms)
     c_min_j_per_k = min(parameters.C_mean.value, *(row.C.value for row in parameters.bridge), inf)
     check_set(parameters.discovered, f"{path}: discovered", c_min_j_per_k)
+    if parameters.discovered and DISCOVERED not in parameters.planner_terms:
+        expected = f"'{DISCOVERED}' among them: only what is simulated is kept within the range of its data"
+        raise InputError(f"{path}: planner_terms", list(parameters.planner_terms), expected)
     for key in parameters.planner_terms:
         if key not in parameters.term_keys:
             raise InputError(

@@ -34,6 +34,12 @@ class ThermalState(Protocol):
     ) -> PulsePeaks:
         """Apply pulses [n] in order of time and return the peaks that they cause. on_progress is called meanwhile."""
 
+    def check_tested(self) -> None:
+        """Raise InputError if a pulse that this very copy applied led out of the range of the data of a function.
+
+        That is of a function that a discovery found: what it is beyond its data nobody knows.
+        """
+
     def solve_pulse(
         self,
         pixel: int,

@@ -91,8 +91,9 @@ class SequencePlanner:
     initial_pixels: pixel on which each stage's mirrors stand at the plan's start, None while unknown
     visiting_orders: by source, visiting orders that replace the scheduler's own
 
-    Raises InputError for an unreachable height or peak-to-peak value. Raises RefusedError under "refuse" for a pulse
-    above a cap or a missed deadline, and under "delay" for a pulse that never fits.
+    Raises InputError for an unreachable height or peak-to-peak value, and for a plan that leads a pixel out of the
+    range of a discovered term's data. Raises RefusedError under "refuse" for a pulse above a cap or a missed deadline,
+    and under "delay" for a pulse that never fits.
     """
 
     def __init__(
@@ -168,6 +169,7 @@ class SequencePlanner:
         # whole.
         heat, lead_in_s = self._heat.copy(), self._scheduler.lead_in_us * 1e-6
         peaks = heat.apply_pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w, self._report_progress)
+        heat.check_tested()
         return PlannedSequence(
             sequence=self._sequence,
             plan=plan,

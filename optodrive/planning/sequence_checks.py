@@ -29,11 +29,12 @@ def check_targets_reachable(display: DisplayModel, sequence: FrameSequence) -> N
         return
     source, pixel, max_m = unreachable
     frame, laser, limits = sequence.frames[source], display.config.laser, display.config.limits
+    within = " within the range of a discovered term's data" if display.parameters.discovered else ""
     raise InputError(
         f"frame {frame.frame_id}: target_um of pixel {pixel}",
         round(m_to_um(float(frame.target_m[pixel])), 3),
         f"at most {m_to_um(max_m):.0f} µm, the reach of the longest pulse "
-        f"({format_quantity(limits.pulse_width_max_s, 's')} at {format_quantity(laser.max_power_w, 'W')})",
+        f"({format_quantity(limits.pulse_width_max_s, 's')} at {format_quantity(laser.max_power_w, 'W')}){within}",
         code="target_unreachable",
     )
 

@@ -2,10 +2,12 @@
 
 Each set is a file, read and planned by the functions that `plan` and `serve` call. The judge integrates the tables of
 the file, and shares no code with physics, planning or the limiter. No uncertainty is declared: it must hide nothing.
+Caps are judged without the refusal of plans that leave the range of a table, which has a test of its own.
 """
 
 import re
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,10 +15,10 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.core.kernels import array_kernel
-from optodrive.core.types.stimuli import FrameSequence, PulseTrain
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config_file import load_config
 from optodrive.device.config_sections import PanelSection
-from optodrive.physics import discovered_term
+from optodrive.physics import discovered_term, extended_display
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 
@@ -170,16 +172,14 @@ def draw_pixel(rng):
     return numbers
 
 
-def write_model(path, pixel, terms, has_wall, is_planned):
+def write_model(path, pixel, terms, has_wall):
     """Write a set of parameters as a diagnosis does."""
 
     def state(name, value, unit):
         return f'[{name}]\nvalue = {value!r}\nunit = "{unit}"\nsource = "drawn"\n'
 
-    planned = 'planner_terms = ["discovered"]\n' if is_planned else ""
-    text = (
-        'format = "optodrive-parameters"\nversion = 1\nname = "own"\nbase = "calibrated"\nclaims = "none"\n' + planned
-    )
+    text = 'format = "optodrive-parameters"\nversion = 1\nname = "own"\nbase = "calibrated"\nclaims = "none"\n'
+    text += 'planner_terms = ["discovered"]\n'
     text += state("tau_g", pixel["tau_g"], "s")
     text += f"[[bridge]]\nwidth_m = {CONFIG.display.bridge_width_m!r}\n"
     text += state("bridge.R", pixel["R"], "K/W") + state("bridge.C", pixel["C"], "J/K")
@@ -192,7 +192,8 @@ def write_model(path, pixel, terms, has_wall, is_planned):
     for term in terms:
         text += '[[discovered]]\nformula = "f"\nsource = "drawn"\n'
         text += "".join(f'{name} = "{term[name]}"\n' for name in ("where", "depends_on", "unit"))
-        text += "".join(f"{name} = {term[name]!r}\n" for name in ("low", "high", "memory_time_s") if name in term)
+        numbers = ("low", "high", "memory_time_s", "max_power_w")
+        text += "".join(f"{name} = {term[name]!r}\n" for name in numbers if name in term)
         text += f"values = {term['values']!r}\n"
     path.write_text(text)
 
@@ -235,6 +236,20 @@ def _look_up(z, term):
 
 
 @array_kernel
+def _choose(quantity, absorber, gas, memory, watts, since_s, drive):
+    """Return the quantity with this number."""
+    if quantity == 0:
+        return absorber
+    if quantity == 1:
+        return gas
+    if quantity == 2:
+        return memory
+    if quantity == 3:
+        return drive
+    return watts if quantity == 4 else since_s
+
+
+@array_kernel
 def _rates(y, out, watts, since_s, pixel, terms):
     """Compute dy/dt of absorber, gas, wall, touch surface, panel and the memories of the terms, all above the room."""
     r, c, tau_g, rw, cw, gas_share, wall_share, lag, rp, cp = pixel
@@ -244,19 +259,7 @@ def _rates(y, out, watts, since_s, pixel, terms):
     for k in range(terms.shape[0]):
         where, quantity = int(terms[k, 0]), int(terms[k, 1])
         base = wall if where == 2 else 0.0
-        z = 0.0
-        if quantity == 0:
-            z = absorber - base
-        elif quantity == 1:
-            z = gas - base
-        elif quantity == 2:
-            z = y[5 + k]
-        elif quantity == 3:
-            z = 0.5 * absorber - gas
-        elif quantity == 4:
-            z = watts
-        else:
-            z = since_s
+        z = _choose(quantity, absorber - base, gas - base, y[5 + k], watts, since_s, 0.5 * absorber - gas)
         out[5 + k] = (absorber - wall - y[5 + k]) / terms[k, 4] if quantity == 2 else 0.0
         if where == 0 and watts <= 0.0:
             continue
@@ -283,8 +286,12 @@ def _rates(y, out, watts, since_s, pixel, terms):
 
 @array_kernel
 def _integrate(edges_s, watts, pixel, terms, step_s):
-    """Return the largest rises of absorber, gas, wall, touch surface and panel, by a Runge–Kutta method."""
+    """Return the largest rises of absorber, gas, wall, touch surface and panel, by a Runge–Kutta method.
+
+    Behind them: by what share of its range, at most, each term's quantity was outside of it.
+    """
     size = 5 + terms.shape[0]
+    outside = np.zeros(terms.shape[0])
     y, peak = np.zeros(size), np.zeros(size)
     k1, k2, k3, k4 = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     for edge in range(len(watts)):
@@ -298,11 +305,23 @@ def _integrate(edges_s, watts, pixel, terms, step_s):
             _rates(y + h * k3, k4, watts[edge], since_s + h, pixel, terms)
             y = y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
             peak = np.maximum(peak, y)
-    return peak
+            for k in range(terms.shape[0]):
+                if terms[k, 0] == 0 and watts[edge] <= 0.0:
+                    continue
+                base = y[2] if pixel[4] > 0.0 else y[4]
+                base = base if terms[k, 0] == 2 else 0.0
+                now_s, drive = since_s + h, 0.5 * y[0] - y[1]
+                z = _choose(int(terms[k, 1]), y[0] - base, y[1] - base, y[5 + k], watts[edge], now_s, drive)
+                beyond = max(terms[k, 2] - z, z - terms[k, 3]) / (terms[k, 3] - terms[k, 2])
+                outside[k] = max(outside[k], beyond)
+    return np.concatenate((peak[:5], outside))
 
 
-def find_peaks_k(plan, pixel, terms, has_wall, after_s=1.0):
-    """Return the largest rises of absorber, gas, wall, touch surface and panel under a plan's pulses."""
+def find_peaks_k(plan, pixel, terms, has_wall, panel=PANEL, after_s=1.0):
+    """Return the largest rises of absorber, gas, wall, touch surface and panel under a plan's pulses.
+
+    Behind them: the share of its range by which each term's quantity leaves it.
+    """
     edges_s, watts = [0.0], []
     for start_s, width_s, power_w in zip(plan.start_s, plan.width_s, plan.power_w, strict=True):
         edges_s += [start_s, start_s + width_s]
@@ -320,7 +339,7 @@ def find_peaks_k(plan, pixel, terms, has_wall, after_s=1.0):
     wall_j_per_k = max(pixel["Cw"], 0.1 / pixel["Rw"]) if has_wall else 0.0
     numbers = [pixel[name] for name in ("R", "C", "tau_g", "Rw")]
     numbers += [wall_j_per_k, *(pixel[name] for name in ("gas_share", "wall_share", "lag"))]
-    numbers += [PANEL[0], PANEL[1] - wall_j_per_k]
+    numbers += [panel[0], panel[1] - wall_j_per_k]
     rows = np.array(rows).reshape(len(terms), 5 + KNOTS)
     fastest_s = min(pixel["tau_g"], pixel["R"] * pixel["C"] / 11.0)
     step_s = min(2e-4, 0.2 * fastest_s)
@@ -337,11 +356,20 @@ def judge(rng, folder):
     return judge_set(folder / "model.toml", pixel, terms, has_wall, is_planned, caps_c, sequence)
 
 
+def load_display(path, caps_c, is_planned=True):
+    """Return the display of a file. Nominal pixels, unless planned, are faster, and the limiter does not know them."""
+    display = DisplayModel.from_config(build_config(path, caps_c))
+    keys = display.parameters.planner_terms if is_planned else ()
+    return replace(display, parameters=display.parameters.model_copy(update={"planner_terms": keys}))
+
+
 def judge_set(path, pixel, terms, has_wall, is_planned, caps_c, sequence):
-    write_model(path, pixel, terms, has_wall, is_planned)
+    write_model(path, pixel, terms, has_wall)
     try:
-        display = DisplayModel.from_config(build_config(path, caps_c))
-        planned, _ = check_feasibility(display, sequence, *display.build_cold_state())
+        display = load_display(path, caps_c, is_planned)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(extended_display, "check_reached", lambda *_: None)
+            planned, _ = check_feasibility(display, sequence, *display.build_cold_state())
     except InputError as error:
         message = str(error)
         assert message.isprintable()
@@ -379,6 +407,109 @@ def test_what_once_passed_a_cap_or_ended_in_a_traceback(seed, tmp_path):
 USUAL = {"R": 184.0, "C": 126e-6, "tau_g": 3e-3, "Rw": 20.0, "Cw": 0.06}
 USUAL |= {"gas_share": 0.3, "wall_share": 0.4, "lag": 1.2}
 TRAIN = FrameSequence((), (PulseTrain(0, 0.0, 1.0, 0.04, 0.004, FULL_W),))
+STILL = 1.0, 1e9
+"""A panel that stays cold, as the pixel's states are planned."""
+
+
+def draw_stimulus(rng):
+    """Return trains, or a height, on the pixel."""
+    if rng.random() < 0.7:
+        return draw_sequence(rng)
+    return FrameSequence((TactileFrame("one", 0.0, 0.5, np.array([10 ** rng.uniform(-5.3, -3.5)])),), ())
+
+
+def draw_mild_term(rng):
+    """Return a term that any file may hold, over a range that the pixel may leave or not."""
+    where = str(rng.choice(list(PLACES)))
+    depends_on = str(rng.choice(PLACES[where][1]))
+    high = {"power": FULL_W, "since_opening": 0.05, "absorber": 250.0}.get(depends_on, 150.0) * rng.uniform(0.3, 1.5)
+    low = -high * rng.uniform(0.2, 1.0) if depends_on == "drive" else 0.0
+    sizes = {
+        "light": 0.2,
+        "heat_capacity": 0.3,
+        "absorber": -0.3 * high / USUAL["R"],
+        "gas": -3e3,
+        "displacement": 3e-5,
+    }
+    shape = [lambda z: z, lambda z: z**2, np.tanh, lambda z: np.sin(3.0 * z)][rng.integers(4)]
+    values = sizes[where] * rng.random() * np.abs(shape(np.linspace(low, high, KNOTS) / high))
+    values -= np.interp(0.0, np.linspace(low, high, KNOTS), values)
+    more = {"memory_time_s": 0.02} if depends_on == "memory" else {}
+    largest_w = FULL_W * float(rng.choice([1.0, 0.7], p=[0.8, 0.2]))
+    return build_term(where, depends_on, low, high, values, max_power_w=largest_w, **more)
+
+
+def find_outside(rng, folder):
+    """Return why a drawn stimulus is refused, and the share of its range by which a term is left in its plan.
+
+    The plan is that without the refusal. None if the set itself is refused, or the stimulus for another reason.
+    """
+    path, caps_c = folder / "model.toml", {"absorber_max_c": 400.0, "wall_max_c": 80.0, "touch_max_c": 80.0}
+    terms, stimulus = [draw_mild_term(rng) for _ in range(int(rng.integers(1, 3)))], draw_stimulus(rng)
+    write_model(path, USUAL, terms, has_wall=False)
+    refusal = ""
+    try:
+        display = load_display(path, caps_c)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(extended_display, "check_reached", lambda *_: None)
+            planned, _ = check_feasibility(display, stimulus, *display.build_cold_state())
+    except InputError:
+        return None
+    try:
+        display = load_display(path, caps_c)
+        check_feasibility(display, stimulus, *display.build_cold_state())
+    except InputError as error:
+        refusal = str(error)
+    peaks = find_peaks_k(planned.plan, USUAL, terms, has_wall=False, panel=STILL)
+    largest_w = min(term["max_power_w"] for term in terms)
+    return refusal, max(*peaks[5:], float(planned.plan.power_w.max(initial=0.0)) / largest_w - 1.0)
+
+
+def judge_range(seeds, folder):
+    """Return the refusals, the shares of what is accepted, and those of what is refused."""
+    found = [each for seed in seeds if (each := find_outside(np.random.default_rng([8, seed]), folder)) is not None]
+    refusals = [refusal for refusal, _ in found if refusal]
+    return refusals, [share for refusal, share in found if not refusal], [share for refusal, share in found if refusal]
+
+
+@pytest.mark.parametrize("count", [100, pytest.param(2000, marks=[pytest.mark.slow, pytest.mark.timeout(7200)])])
+def test_a_plan_that_leaves_the_range_of_a_table_is_refused_in_one_line(count, tmp_path):
+    refusals, accepted, refused = judge_range(range(count), tmp_path)
+    print(f"{len(accepted)} accepted, at most {max(accepted):.4f} outside; {len(refused)} refused, {min(refused):.4f}")
+    assert max(accepted) < 0.015  # 1 % of the range are permitted to the integrators
+    assert min(refused) > 0.005
+    assert min(len(accepted), len(refused)) > 0.1 * count
+    for refusal in refusals:
+        assert len(refusal) <= LINE_MAX
+        place = r"pixel 0: .*: got \S+ \S+, expected .* to .*, the range of its data, .*"
+        assert re.fullmatch(
+            rf"{place}|frame one: target_um of pixel 0: .* the range of a discovered term's data", refusal
+        )
+
+
+ONE_PULSE = FrameSequence((), (PulseTrain(0, 0.0, 0.01, 0.003, 0.01, FULL_W),))
+
+
+@pytest.mark.parametrize("is_mutant", [False, True])
+def test_what_a_gas_reaches_after_the_last_pulse_counts(is_mutant, tmp_path, monkeypatch):
+    """Also a mutant, which notes what is reached until the last gate closes."""
+    path, caps_c = tmp_path / "model.toml", {"absorber_max_c": 400.0, "wall_max_c": 80.0, "touch_max_c": 80.0}
+    write_model(path, USUAL, [build_term("displacement", "gas", 0.0, 500.0, [0.0] * KNOTS)], has_wall=False)
+    display = load_display(path, caps_c)
+    plan = check_feasibility(display, ONE_PULSE, *display.build_cold_state())[0].plan
+    reached_k = find_peaks_k(plan, USUAL, [], has_wall=False, panel=STILL)[1]
+    write_model(path, USUAL, [build_term("displacement", "gas", 0.0, 0.95 * reached_k, [0.0] * KNOTS)], has_wall=False)
+    display = load_display(path, caps_c)
+    if is_mutant:
+        monkeypatch.setattr(extended_display, "add_peaks_after_off", lambda *_: None)
+        check_feasibility(display, ONE_PULSE, *display.build_cold_state())
+    else:
+        with pytest.raises(
+            InputError, match=r"pixel 0: gas of the discovered term in displacement: got .* K, expected 0 K to"
+        ):
+            check_feasibility(display, ONE_PULSE, *display.build_cold_state())
+
+
 OFFSET = [2.0, *[0.0] * (KNOTS - 2), -2.5e6]
 
 

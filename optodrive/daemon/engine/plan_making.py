@@ -280,8 +280,9 @@ def make_plan(
     growth, feasibility = None, None
     if push.streamed:
         growth = _begin_streamed(display, request, built.sequence, snapshot, on_progress)
-        is_page = request.select is not None
-        planned = growth.plan_until(horizon_s if not is_page and may_grow(push, built.sequence, len(scales)) else inf)
+        # What leaves the range of a discovered term's data is refused as a whole, before any of it is played.
+        is_whole = request.select is not None or display.parameters.discovered
+        planned = growth.plan_until(horizon_s if not is_whole and may_grow(push, built.sequence, len(scales)) else inf)
     else:
         heat, budget = snapshot.before.heat, snapshot.before.budget
         planned, feasibility = check_feasibility(display, built.sequence, heat, budget, on_progress, **push.options)

@@ -233,8 +233,8 @@ def build_model_toml(
         lines += ["", "[[discovered]]", source]
         lines += [f'{name} = "{getattr(term, name)}"' for name in ("where", "depends_on", "unit", "formula")]
         lines += [f"{name} = {getattr(term, name)!r}" for name in ("low", "high")]
-        if term.memory_time_s is not None:
-            lines.append(f"memory_time_s = {term.memory_time_s!r}")
+        optional = {name: getattr(term, name) for name in ("memory_time_s", "max_power_w")}
+        lines += [f"{name} = {value!r}" for name, value in optional.items() if value is not None]
         lines.append(f"values = [{', '.join(f'{value:.9g}' for value in term.values)}]")
     return "\n".join(lines) + "\n"
 

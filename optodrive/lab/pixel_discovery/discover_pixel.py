@@ -12,6 +12,7 @@ from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, Mode
 from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances, remove_disturbances
 from optodrive.lab.diagnosis.model_selection import has_replicate_excess
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, fit_nominal
+from optodrive.lab.diagnosis.prediction import EPSILON
 from optodrive.lab.discovery import discover
 from optodrive.lab.inference.claim import NOTHING_SOUGHT, TermForm
 from optodrive.lab.pixel_discovery.experiment_records import build_records
@@ -65,6 +66,7 @@ def discover_in_pixel(
         answer.extended_rmse,
         answer.parameters,
         perf_counter() - began_s,
+        max(float(record.inputs[:, 0].max()) for record in records) / EPSILON,
     )
 
 

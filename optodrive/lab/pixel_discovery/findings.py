@@ -44,7 +44,8 @@ class PixelDiscovery:
 
     disturbances: of the instruments, subtracted before all else; claim: of all terms; judged_by: what no fit has seen,
     empty if nothing was sought; error_before, error_after: root mean square errors of the nominal and the extended
-    pixel there, in units of the noise; parameters: of the extended pixel, SI
+    pixel there, in units of the noise; parameters: of the extended pixel, SI; max_power_w: largest incident power of
+    the recording
     """
 
     findings: tuple[PixelFinding, ...]
@@ -55,3 +56,4 @@ class PixelDiscovery:
     error_after: float
     parameters: dict[str, float]
     elapsed_s: float
+    max_power_w: float = 0.0

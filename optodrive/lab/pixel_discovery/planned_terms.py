@@ -49,7 +49,7 @@ def build_planned_terms(discovery: PixelDiscovery) -> PlannedTerms:
             refused.append(f"{finding.term.chosen.formula} acts on a pixel without light")
         else:
             try:
-                terms.append(_build_term(finding, finding.curve, discovery.parameters))
+                terms.append(_build_term(finding, finding.curve, discovery))
             except ValidationError as error:
                 refused.append(str(build_input_error(error, finding.term.chosen.formula)))
     return PlannedTerms(base, tuple(terms), tuple(refused))
@@ -64,12 +64,12 @@ def _acts_when_cold(finding: PixelFinding, curve: Curve) -> bool:
     )
 
 
-def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float]) -> DiscoveredTerm:
+def _build_term(finding: PixelFinding, curve: Curve, discovery: PixelDiscovery) -> DiscoveredTerm:
     """Return the function of one finding.
 
     Rates of the absorber become heat flows by its capacity, absorbed light becomes incident light.
     """
-    form = finding.term.chosen
+    form, parameters = finding.term.chosen, discovery.parameters
     variable, *factor = form.depends_on
     where, depends_on, low = form.where, variable, float(curve.x[0])
     if where == RATE_OF_ABSORBER and depends_on in ("memory", "gas"):
@@ -101,6 +101,7 @@ def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float
             "high": high,
             "values": values.tolist(),
             "memory_time_s": parameters["tau_m"] if depends_on == "memory" else None,
+            "max_power_w": discovery.max_power_w or None,
             "source": "a discovery",
         }
     )
