@@ -12,7 +12,7 @@ import typer
 from optodrive.cli.options import ConfigOption, HoldOption, JsonOption, UrlOption
 from optodrive.cli.output import announce_compilation, print_answer, show_progress
 from optodrive.core.daemon_url import DEFAULT_URL
-from optodrive.core.errors import InputError, NotReadyError, Unquoted
+from optodrive.core.errors import MISSING, InputError, NotReadyError, Unquoted
 
 if TYPE_CHECKING:
     from optodrive.core.types.arrays import FloatArray
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from optodrive.study.page_respondent import PageRespondent
     from optodrive.study.presenter import Presenter
     from optodrive.study.session import Respondent
-    from optodrive.study.study_file import MatchingSection, Study
+    from optodrive.study.study_file import Study
+    from optodrive.study.study_sections import MatchingSection
     from optodrive.study.trial_log import TrialLog
 
 PARTICIPANTS_MAX = 1000
@@ -40,6 +41,10 @@ def study(
             metavar="ID",
             help="A person's code: answers at this terminal, on the daemon's armed display.",
         ),
+    ] = None,
+    session: Annotated[
+        int | None,
+        typer.Option("--session", metavar="N", help="Number of the person's session, in a study of several."),
     ] = None,
     participants: Annotated[
         int,
@@ -69,6 +74,7 @@ def study(
     from optodrive.core.files import check_output
     from optodrive.study.dataset import check_new_participant, check_participant, read_participants, write_dataset
     from optodrive.study.study_file import SIMULATED_PREFIX, load_study
+    from optodrive.study.trial_list import list_trials
 
     design = load_study(source)
     check_output("--out", out, folder=True, may_exist=True)
@@ -82,6 +88,8 @@ def study(
             raise InputError("--lsl", True, "--participant: a simulated board has no time of this computer")
         if hold:
             raise InputError("--hold", True, "--participant: a simulated participant arms no board")
+        if session is not None:
+            raise InputError("--session", session, "--participant: a simulated participant takes part in all sessions")
     else:
         if participants != 1:
             raise InputError("--participants", participants, "none beside --participant, which is one person")
@@ -91,12 +99,19 @@ def study(
         check_new_participant("--participant", out, participant)
         if participant.startswith(SIMULATED_PREFIX):
             raise InputError("--participant", participant, f"a code that does not begin with {SIMULATED_PREFIX!r}")
+        if not (session is None if design.sessions == 1 else session is not None and 1 <= session <= design.sessions):
+            expected = "none: the study has one session" if design.sessions == 1 else f"1 to {design.sessions}"
+            raise InputError("--session", MISSING if session is None else session, expected)
+        list_trials(design, participant, session or 1)  # refuses a code without a number beside a Latin square
     display_config = _load_display_config(design, participant, url, config)
     try:
         if participant is None:
             sessions = _simulate(design, out, participants, display_config)
         else:
-            sessions = {participant: _run_person(design, out, participant, url, hold, lsl, page, display_config)}
+            person = participant, session or 1
+            sessions = {
+                _name_session(design, *person): _run_person(design, out, *person, url, hold, lsl, page, display_config)
+            }
     except BaseException:  # a session that has not ended has tables, too
         with suppress(InputError):
             if (out / "sourcedata").is_dir():
@@ -130,10 +145,11 @@ def _simulate(
     from optodrive.planning.display_model import DisplayModel
     from optodrive.study.dataset import build_log_path
     from optodrive.study.observers import Observer, Participant
-    from optodrive.study.presenter import VirtualPresenter, check_stimuli
-    from optodrive.study.session import SimulatedRespondent, build_matching_model, draw_order, run_session
+    from optodrive.study.presenter import VirtualPresenter
+    from optodrive.study.session import SimulatedRespondent, build_matching_model, run_session
     from optodrive.study.study_file import SIMULATED_PREFIX
     from optodrive.study.trial_log import TrialLog
+    from optodrive.study.trial_stimulus import check_stimuli
 
     if design.simulation is None or config is None:
         raise InputError(f"study {design.name}: simulation", None, "an observer, to simulate a participant")
@@ -141,22 +157,28 @@ def _simulate(
     display, sessions = DisplayModel.from_config(config), {}
     announce_compilation()
     with show_progress("simulating") as on_progress:
-        for number in range(1, participants + 1):
+        runs = [(number, session) for number in range(1, participants + 1) for session in range(1, design.sessions + 1)]
+        for done, (number, session) in enumerate(runs, start=1):
             name = f"{SIMULATED_PREFIX}{number:02}"
-            with TrialLog(build_log_path(out, design, name), design, name, draw_order(design, name)) as log:
-                if log.next_trial is not None:
+            with TrialLog(build_log_path(out, design, name, session), design, name, session) as log:
+                if not log.is_ended:
                     log.begin_run("simulated board in virtual time")
                     presenter = VirtualPresenter(display)
                     sensitivity = _draw_sensitivity(design, number, display.layout)
                     observer = Observer(design, display, Participant(), sensitivity)
-                    respondent = SimulatedRespondent(observer, design.seed, number, presenter)
+                    respondent = SimulatedRespondent(observer, design.seed, number, presenter, session)
                     section = design.matching
                     matched = None if section is None else build_matching_model(section, display.layout)
                     run_session(design, log, presenter, respondent, matching=matched)
                     presenter.close()
-                sessions[name] = list(log.trials.values())
-            on_progress(number / participants)
+                sessions[_name_session(design, name, session)] = list(log.trials.values())
+            on_progress(done / len(runs))
     return sessions
+
+
+def _name_session(design: "Study", participant: str, session: int) -> str:
+    """Return the participant's code, with the session in a study of several."""
+    return participant if design.sessions == 1 else f"{participant}_ses-{session}"
 
 
 def _draw_sensitivity(design: "Study", number: int, layout: "PixelLayout") -> "FloatArray":
@@ -191,7 +213,7 @@ def _write_sensitivity(
             "written": str(path),
         }
         if name.startswith(SIMULATED_PREFIX):
-            number = int(name.removeprefix(SIMULATED_PREFIX))
+            number = int(name.removeprefix(SIMULATED_PREFIX).partition("_")[0])
             truth = _draw_sensitivity(design, number, build_pixel_layout(config.display))
             found[name]["variation"] = compute_variation(truth, 1.0, matching.intensity)
             found[name]["residual_variation"] = compute_variation(truth, known.sensitivity, matching.intensity)
@@ -202,6 +224,7 @@ def _run_person(
     design: "Study",
     out: Path,
     participant: str,
+    session: int,
     url: str,
     hold: bool,
     lsl: bool,
@@ -215,17 +238,17 @@ def _run_person(
     from optodrive.study.dataset import build_log_path
     from optodrive.study.lab_streams import LabStreams, PublishingPresenter
     from optodrive.study.page_messages import parse_page_address
-    from optodrive.study.presenter import check_stimuli
-    from optodrive.study.session import build_matching_model, draw_order, run_session
+    from optodrive.study.session import build_matching_model, run_session
     from optodrive.study.terminal import TerminalRespondent
     from optodrive.study.trial_log import TrialLog
+    from optodrive.study.trial_stimulus import check_stimuli
 
     address = None if page is None else parse_page_address("--page", page)
     with ExitStack() as stack:
         log = stack.enter_context(
-            TrialLog(build_log_path(out, design, participant), design, participant, draw_order(design, participant))
+            TrialLog(build_log_path(out, design, participant, session), design, participant, session)
         )
-        if log.next_trial is None:
+        if log.is_ended:
             return list(log.trials.values())
         display = stack.enter_context(Display(url))  # stops what was started, also after an error
         check_stimuli(design, display.config())
@@ -302,10 +325,11 @@ def _call_all(listeners: Sequence[Callable[[dict[str, Any]], None]], record: dic
 
 
 def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], out: Path) -> dict[str, Any]:
-    from optodrive.study.results import Accuracy, count_correct, fit_magnitudes
-    from optodrive.study.session import build_threshold_model, list_answered
+    from optodrive.study.results import Accuracy, count_correct, fit_magnitudes, list_thresholds
 
-    published, records = design.published, [record for session in sessions.values() for record in session]
+    published = design.published
+    sessions = {name: [one for one in records if one["phase"] == "main"] for name, records in sessions.items()}
+    records = [record for session in sessions.values() for record in session]
     report: dict[str, Any] = {
         "study": design.name,
         "participants": {name: len(session) for name, session in sessions.items()},
@@ -314,18 +338,14 @@ def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], ou
         "repeated": sum(record["attempt"] > 1 for record in records),
         "chance_level": design.response.chance_level,
     }
-    if design.response.correct_factor is not None:
+    if design.response.rules:
         counted = count_correct(records)
-        report |= {"correct": counted.correct, "accuracy": counted.share}
-    elif design.response.kind == "magnitude":
+        report |= {"correct": counted.correct, "judged": counted.trials, "accuracy": counted.share}
+    elif design.response.kind == "magnitude" and len(design.factors) == 1:
         report["line"] = fit_magnitudes(design, list(sessions.values()))._asdict()
     if design.procedure is not None:
-        model = build_threshold_model(design, design.procedure)
         report["threshold_of"] = design.procedure.parameter
-        report["thresholds"] = {
-            name: model.estimate(list_answered(design.procedure, session))._asdict()
-            for name, session in sessions.items()
-        }
+        report["thresholds"] = list_thresholds(design, design.procedure, sessions)
     if published is not None:
         report["published"] = published.model_dump(mode="json") | {"trials": published.trials}
         if published.correct is not None:
@@ -340,7 +360,7 @@ def _format_report(report: dict[str, Any]) -> Iterator[str]:
         yield f"repeated         {report['repeated']} trials whose first attempt was interrupted or spoiled"
     if "accuracy" in report:
         yield (
-            f"correct          {report['correct']} of {report['trials']}, {100 * report['accuracy']:.1f} % "
+            f"correct          {report['correct']} of {report['judged']}, {100 * report['accuracy']:.1f} % "
             f"(by chance {100 * report['chance_level']:.1f} %)"
         )
     if "line" in report:
@@ -348,6 +368,10 @@ def _format_report(report: dict[str, Any]) -> Iterator[str]:
         means, values = line["r_squared"], line["participants_r_squared"]
         yield f"line             r² {means:.3f} of the means, {values:.2f} of all values"
     for name, found in report.get("thresholds", {}).items():
+        if "threshold" not in found:
+            equality = f"{report['threshold_of']} {found['equality']:.3g}"
+            yield f"equality         {name}: {equality} ({found['reversals']} reversals)"
+            continue
         interval = f"95 % interval {found['low']:.3g} to {found['high']:.3g}"
         yield f"threshold        {name}: {report['threshold_of']} {found['threshold']:.3g} ({interval})"
         yield from (f"doubtful         {name}: {doubt}" for doubt in found["doubts"])

@@ -2,15 +2,20 @@
 
 import time
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from optodrive.client.display import Display
 from optodrive.client.plan import Plan
 from optodrive.core.errors import RefusedError
-from optodrive.study.presenter import TIME_TOLERANCE_S, Presentation, RequestedStimulus
-from optodrive.study.study_file import Value
+from optodrive.study.presenter import (
+    TIME_TOLERANCE_S,
+    Presentation,
+    RequestedStimulus,
+    build_empty_presentation,
+    place_intervals,
+)
+from optodrive.study.trial_stimulus import TrialStimulus
 
 
 class DaemonPresenter:
@@ -20,21 +25,23 @@ class DaemonPresenter:
     """
 
     def __init__(self, display: Display, labels: Mapping[str, str | int | float | bool]) -> None:
-        self._display, self._labels = display, labels
+        self._display, self._labels, self.config = display, labels, display.config()
 
-    def present(self, pattern: str, parameters: Mapping[str, Value]) -> Presentation:
-        """Play a pattern and wait for its end. Raise the daemon's error if it is refused or fails.
+    def present(self, stimulus: TrialStimulus) -> Presentation:
+        """Play a stimulus and wait for its end. Raise the daemon's error if it is refused or fails.
 
         Raise RefusedError if the daemon runs on another computer: response times need one clock.
         """
-        arguments: dict[str, Any] = {**parameters, "policy": "refuse"}
         called_s = time.monotonic()
-        plan = self._display.play(pattern, labels=self._labels, **arguments)
+        if stimulus.sequence is None:
+            time.sleep(stimulus.duration_s)
+            return place_intervals(stimulus, build_empty_presentation(called_s))
+        plan = self._display.push(stimulus.to_body(), labels=self._labels, policy="refuse")
         if plan.onset is not None and not called_s <= plan.onset.monotonic_s <= time.monotonic():
             raise RefusedError("the daemon's clock is not that of this computer: run the study where the daemon runs")
         columns = plan.executed_pulses
         start_s = np.asarray([] if columns is None else columns.start_s, dtype=np.float64)
-        return Presentation(
+        shown = Presentation(
             onset_s=0.0 if plan.onset is None else plan.onset.board_s,
             pixel=np.asarray([] if columns is None else columns.pixel, dtype=np.int64),
             start_s=start_s - start_s.min(initial=np.inf) if len(start_s) else start_s,
@@ -45,6 +52,10 @@ class DaemonPresenter:
             height_m=None if columns is None or not columns.simulated_um else 1e-6 * max(columns.simulated_um),
             requested=_describe_request(plan),
         )
+        shown = place_intervals(stimulus, shown)
+        if shown.silent_end_s and shown.onset_monotonic_s is not None:
+            self.wait(max(0.0, shown.onset_monotonic_s + shown.silent_end_s - time.monotonic()))
+        return shown
 
     def wait(self, duration_s: float) -> None:
         """Wait by the computer's clock."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from optodrive.core.extras import import_extra
 from optodrive.study.presenter import Presentation, Presenter
-from optodrive.study.study_file import Value
+from optodrive.study.trial_stimulus import TrialStimulus
 
 PULSE_CHANNELS = (("pixel", ""), ("width", "s"), ("power", "W"), ("board_time", "s"))
 CONSUMER_WAIT_S = 0.2
@@ -52,7 +52,7 @@ class LabStreams:
 
     def publish_pulses(self, shown: Presentation) -> None:
         """Publish the pulses of a presentation on a board, whose host knows when it began."""
-        if shown.onset_monotonic_s is None:
+        if shown.onset_monotonic_s is None or shown.onset_s is None:
             return
         for pixel, start_s, width_s, power_w in zip(
             shown.pixel, shown.start_s, shown.width_s, shown.power_w, strict=True
@@ -70,11 +70,11 @@ class PublishingPresenter:
     """A presenter whose pulses are published."""
 
     def __init__(self, presenter: Presenter, streams: LabStreams) -> None:
-        self._presenter, self._streams = presenter, streams
+        self._presenter, self._streams, self.config = presenter, streams, presenter.config
 
-    def present(self, pattern: str, parameters: Mapping[str, Value]) -> Presentation:
-        """Show a pattern and publish the executed pulses."""
-        shown = self._presenter.present(pattern, parameters)
+    def present(self, stimulus: TrialStimulus) -> Presentation:
+        """Show a stimulus and publish the executed pulses."""
+        shown = self._presenter.present(stimulus)
         self._streams.publish_pulses(shown)
         return shown
 

@@ -13,10 +13,16 @@ path encloses. A localisation is the nearest of the places. The odd one of three
 (`sensation`) differ most from those of the others, with a Weber fraction of 0.2 (Craig 1972; Forta et al. 2012 find
 0.2 to 0.6). A magnitude is the perceived intensity with noise of the same kind, and so are the two that are compared.
 Fingers are not confused.
+
+Intervals are compared by one feature: intensity, rate of the pulses, longest pause, or distance of the outermost
+places, each with noise. Onsets are ordered with a standard deviation of 30 ms (some 20 to 40 ms for taps on two places;
+Hirsh and Sherrick 1961). A pattern is identified by the nearest of the study's own, pixel by pixel, with the sense of
+place above. Two places are felt as one motion if their onsets are less than some 150 ms apart (Kirman 1974).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +36,8 @@ from optodrive.planning.stimuli.experiments import compute_finger_places
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.study.presenter import Presentation
 from optodrive.study.study_file import Study
+from optodrive.study.trial_list import ListedTrial
+from optodrive.study.trial_stimulus import build_stimulus, find_correct_answer
 
 REFERENCE_S = 0.5
 WEBER_FRACTION = 0.2
@@ -40,6 +48,15 @@ STIMULUS_PAUSE_S = 0.2
 MAGNITUDE_BOUNDS = (0.01, 0.99)
 FULL_SCALE = 1.25
 """End of the scale of magnitudes, as a factor of the intensity at the highest power."""
+NUMBER_SCALE = 50.0
+"""Number for the strongest sensation, where any number may be answered."""
+FEATURE_NOISE = {"intensity": WEBER_FRACTION, "rate": WEBER_FRACTION, "gap": 0.010, "extent": 2e-3}
+"""Standard deviation of each feature, in its own unit."""
+SAME_PULSE_S = 2e-3
+"""Pause up to which two pulses are one."""
+ORDER_SD_S = 0.030
+MOTION_S, MOTION_NOISE = 0.150, 0.4
+"""Largest time between two onsets of one motion, s, and the standard deviation of its logarithm."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +102,7 @@ class Observer:
     ) -> None:
         if study.simulation is None:
             raise ValueError(f"study {study.name} states no observer")
-        self._study, self._display, self._participant = study, display, participant
+        self.study, self._display, self._participant = study, display, participant
         self._layout, self._lattice = display.layout, Lattice.from_config(display.config)
         self._sensitivity = np.ones(len(display.layout)) if sensitivity is None else sensitivity
         self._pitch_m = display.config.display.pitch_m
@@ -98,20 +115,24 @@ class Observer:
             "digits": self._name_digits,
             "detection": self._detect,
             "comparison": self._compare,
+            "interval": self._choose_interval,
+            "order": self._order,
+            "identification": self._identify,
+            "motion": self._judge_motion,
         }
         self._perceive = rules[study.simulation.observer]
 
     def answer(self, shown: Presentation, rng: np.random.Generator) -> str | float:
         """Return the answer to a presentation: one of the study's, or a magnitude."""
-        if rng.random() < self._participant.lapse:
-            answers = self._study.response.answers
-            return answers[int(rng.integers(len(answers)))] if answers else float(rng.uniform(*MAGNITUDE_BOUNDS))
-        observer = "" if self._study.simulation is None else self._study.simulation.observer
-        key, possible = f"study {self._study.name}: simulation.observer", self._study.response.answers
+        if rng.random() < self._participant.lapse or not len(shown.pixel):
+            answers = self.study.response.answers
+            return answers[int(rng.integers(len(answers)))] if answers else self._scale(float(rng.uniform()))
+        observer = "" if self.study.simulation is None else self.study.simulation.observer
+        key, possible = f"study {self.study.name}: simulation.observer", self.study.response.answers
         try:
             answer = self._perceive(shown, rng)
-        except (ValueError, IndexError):  # the stimulus has other parts than those that the observer compares
-            raise InputError(key, observer, f"an observer of {self._study.stimulus.pattern}") from None
+        except (ValueError, IndexError, KeyError):  # the stimulus has other parts than those that the observer compares
+            raise InputError(key, observer, f"an observer of {self.study.stimulus.pattern}") from None
         if (answer not in possible) if possible else isinstance(answer, str):
             expected = f"an observer whose answers are {', '.join(possible) or 'magnitudes'}; this one answers {answer}"
             raise InputError(key, observer, expected)
@@ -136,7 +157,7 @@ class Observer:
         passes = self._perceive_places(visits, rng).reshape(-1, 3, 2)
         x_m, y_m = (passes[:, 2] - passes[:, 0]).mean(axis=0)
         moved_m = {"right": x_m, "left": -x_m, "up": y_m, "down": -y_m}
-        return max(self._study.response.answers, key=moved_m.__getitem__)
+        return max(self.study.response.answers, key=moved_m.__getitem__)
 
     def _judge_rotation(self, shown: Presentation, rng: np.random.Generator) -> str:
         x_m, y_m = self._perceive_places(self.list_visits(shown), rng).T
@@ -150,14 +171,19 @@ class Observer:
             last_s = shown.start_s[np.argmax(np.diff(shown.start_s)) + 1]
             visits = Visits(visits.pixel, visits.position_m, np.array([shown.duration_s - last_s + PERSISTENCE_S]))
         right, up = (self._perceive_places(visits, rng)[-1] - centre_m) / self._pitch_m
-        places = {answer: divmod(int(answer) - 1, 3) for answer in self._study.response.answers}
+        places = {answer: divmod(int(answer) - 1, 3) for answer in self.study.response.answers}
         return min(places, key=lambda answer: (right - places[answer][1] + 1) ** 2 + (up + places[answer][0] - 1) ** 2)
 
     def _rate(self, shown: Presentation, rng: np.random.Generator) -> float:
         intensity = self.respond(shown)[0].intensity
         noisy = intensity * np.exp(WEBER_FRACTION * rng.standard_normal())
         brightest = self.respond_at_full_power(shown).intensity
-        return float(np.clip(noisy / (FULL_SCALE * brightest), *MAGNITUDE_BOUNDS))
+        return self._scale(noisy / (FULL_SCALE * brightest))
+
+    def _scale(self, share: float) -> float:
+        """Return a share of the strongest sensation on the scale of the study, which has no end for numbers."""
+        bounded = float(np.clip(share, *MAGNITUDE_BOUNDS))
+        return bounded if self.study.response.kind == "magnitude" else round(NUMBER_SCALE * bounded, 1)
 
     def _find_odd(self, shown: Presentation, rng: np.random.Generator) -> str:
         felt = np.log1p([list(signals) for signals in self.respond(shown)])
@@ -180,13 +206,74 @@ class Observer:
         strongest = max(self._excite(shown, rows, shown.power_w))
         if rng.random() < -np.expm1(-(strongest**DETECTION_SLOPE)):
             return "left" if self._layout.x_m[shown.pixel[0]] < 0.0 else "right"
-        return self._study.response.answers[int(rng.integers(len(self._study.response.answers)))]
+        return self.study.response.answers[int(rng.integers(len(self.study.response.answers)))]
 
     def _compare(self, shown: Presentation, rng: np.random.Generator) -> str:
         """Name the stronger of two stimuli, the first or the second of the answers."""
         felt = np.log1p([signals.intensity for signals in self.respond(shown)])
         noisy = felt + WEBER_FRACTION * rng.standard_normal(len(felt))
-        return self._study.response.answers[int(noisy.argmax())]
+        return self.study.response.answers[int(noisy.argmax())]
+
+    def _split(self, shown: Presentation) -> list[IntArray]:
+        """Return the pulses of each interval, as rows."""
+        return [
+            np.flatnonzero((shown.start_s >= start_s - 1e-3) & (shown.start_s < end_s - 1e-3))
+            for _, start_s, end_s in shown.intervals
+        ]
+
+    def _choose_interval(self, shown: Presentation, rng: np.random.Generator) -> str:
+        """Name the interval with the largest feature by its place."""
+        feature = "intensity" if self.study.simulation is None else self.study.simulation.feature
+        felt = [self._measure(feature, shown, rows) if len(rows) else 0.0 for rows in self._split(shown)]
+        noisy = np.array(felt) + FEATURE_NOISE[feature] * rng.standard_normal(len(felt))
+        return self.study.response.answers[int(noisy.argmax())]
+
+    def _measure(self, feature: str, shown: Presentation, rows: IntArray) -> float:
+        """Return a feature of a stimulus: logarithms of 1 + intensity and of the rate, s of a pause, m of an extent."""
+        start_s, end_s, pixel = shown.start_s[rows], (shown.start_s + shown.width_s)[rows], shown.pixel[rows]
+        if feature == "intensity":
+            signals = [self._respond_to_pulses(shown, rows[pixel == one], shown.power_w) for one in np.unique(pixel)]
+            return float(np.log1p(max(each.intensity for each in signals)))
+        if feature == "extent":
+            x_m, y_m = self._layout.x_m[pixel], self._layout.y_m[pixel]
+            return float(np.hypot(x_m[:, None] - x_m, y_m[:, None] - y_m).max())
+        pauses_s = (start_s[1:] - end_s[:-1])[start_s[1:] - end_s[:-1] > SAME_PULSE_S]
+        if feature == "gap":
+            return float(pauses_s.max(initial=0.0))
+        return float(np.log(max(1, len(pauses_s)) / max(start_s[-1] - start_s[0], SAME_PULSE_S)))
+
+    def _order(self, shown: Presentation, rng: np.random.Generator) -> str:
+        """Name the interval that seems to begin first."""
+        onset_s = [shown.start_s[rows[0]] if len(rows) else np.inf for rows in self._split(shown)]
+        return shown.intervals[int(np.argmin(np.array(onset_s) + ORDER_SD_S * rng.standard_normal(len(onset_s))))].name
+
+    def _identify(self, shown: Presentation, rng: np.random.Generator) -> str:
+        """Name the pattern whose places are nearest to those that are felt."""
+        pixel, visits = np.unique(shown.pixel, return_counts=True)
+        exposure_s = np.full(len(pixel), shown.duration_s / max(1, len(pixel)) + PERSISTENCE_S) * np.maximum(1, visits)
+        position_m = np.column_stack([self._layout.x_m[pixel], self._layout.y_m[pixel]])
+        felt_m = self._perceive_places(Visits(pixel.tolist(), position_m, exposure_s), rng)
+        return min(self._templates, key=lambda name: _measure_distance_m(felt_m, self._templates[name]))
+
+    @cached_property
+    def _templates(self) -> dict[str, FloatArray]:
+        """Places of the pattern of each correct answer, m, [n, 2]."""
+        found: dict[str, FloatArray] = {}
+        for condition in self.study.conditions:
+            trial = ListedTrial("main", "main", False, condition, self.study.interval_names)
+            sequence = build_stimulus(self.study, trial, condition, self._display.config).sequence
+            answer = find_correct_answer(self.study, trial, condition)
+            if sequence is not None and answer is not None:
+                pixels = {train.pixel for train in sequence.trains}
+                pixels |= {int(pixel) for frame in sequence.frames for pixel in np.flatnonzero(frame.target_m)}
+                index = sorted(pixels)
+                found[answer] = np.column_stack([self._layout.x_m[index], self._layout.y_m[index]])
+        return found
+
+    def _judge_motion(self, shown: Presentation, rng: np.random.Generator) -> str:
+        """Judge whether two places follow each other fast enough to be one motion."""
+        between_s = float(np.diff(shown.start_s[np.flatnonzero(np.diff(shown.pixel, prepend=-1))]).mean())
+        return "motion" if between_s * np.exp(MOTION_NOISE * rng.standard_normal()) < MOTION_S else "succession"
 
     def respond(self, shown: Presentation) -> list[ChannelSignals]:
         """Return the channels' signals of each stimulus on one pixel. Stimuli are separated by pauses."""
@@ -210,3 +297,9 @@ class Observer:
         pixel = int(shown.pixel[rows[0]])
         meissner, pacinian = compute_pulse_excitations(self._display.build_cold_heat(), pulses, pixel)
         return float(self._sensitivity[pixel] * meissner), float(self._sensitivity[pixel] * pacinian)
+
+
+def _measure_distance_m(felt_m: FloatArray, pattern_m: FloatArray) -> float:
+    """Return the mean distance from each place to the nearest of the other pattern, both ways, m. [n, 2], [m, 2]."""
+    distance_m = np.linalg.norm(felt_m[:, None] - pattern_m[None], axis=2)
+    return float(distance_m.min(axis=0).mean() + distance_m.min(axis=1).mean())

@@ -18,18 +18,20 @@ from optodrive.daemon.api.error_handlers import send_problem
 from optodrive.daemon.api.host_check import LOOPBACK_NAMES, check_host_and_origin
 from optodrive.daemon.api.request_limits import App, Receive, Scope, Send, join_headers
 from optodrive.daemon.api.static_files import MEDIA_TYPES, SECURITY_HEADERS
-from optodrive.study.study_file import Value
+from optodrive.study.study_sections import QuestionSection, Value
 
-MESSAGE_MAX_BYTES = 1024
+MESSAGE_MAX_BYTES = 16_384
 """Largest message of a page."""
 HANDLED_MAX_S = 60.0
+FORM_TEXT_MAX = 200
+"""Longest answer to a question of a questionnaire, characters."""
 
 Index = Annotated[int, Field(ge=0)]
-Phase = Literal["start", "pause", "example", "stimulus", "question", "rest", "done", "stopped"]
+Phase = Literal["start", "pause", "form", "example", "stimulus", "question", "rest", "done", "stopped"]
 """The state of the session as a participant sees it.
 
-start: waits for the participant's button; pause: by the operator; example: a stimulus without a question;
-rest: the answer is noted, and the next stimulus comes; stopped: the program ends before the last trial
+start: waits for the participant's button; pause: by the operator; form: a questionnaire; example: a stimulus without a
+question; rest: between two stimuli, or after the last; stopped: the program ends before the last trial
 """
 
 
@@ -64,6 +66,13 @@ class ReadyMessage(Section):
     kind: Literal["ready", "break"]
 
 
+class FormMessage(Section):
+    """The answers to a questionnaire, by the names of its questions."""
+
+    kind: Literal["form"]
+    answers: dict[str, Annotated[str, Field(max_length=FORM_TEXT_MAX)] | float]
+
+
 class SeenMessage(Section):
     """A page has received the view with this number."""
 
@@ -77,7 +86,7 @@ class OperatorMessage(Section):
     kind: Literal["pause", "resume", "stop"]
 
 
-ParticipantMessage = AnswerMessage | AgainMessage | ReadyMessage | SeenMessage
+ParticipantMessage = AnswerMessage | AgainMessage | ReadyMessage | FormMessage | SeenMessage
 PARTICIPANT_MESSAGES: TypeAdapter[ParticipantMessage] = TypeAdapter(
     Annotated[ParticipantMessage, Field(discriminator="kind")]
 )
@@ -87,19 +96,33 @@ OPERATOR_MESSAGES: TypeAdapter[OperatorMessage] = TypeAdapter(OperatorMessage)
 class ParticipantView(JsonModel):
     """All that the participant's page shows. It never holds a condition.
 
-    trial: number of the present or next trial, from 1; trials: number of all
+    labels: what is read in place of each answer; again: whether the stimulus may be felt again
+    trial: number of the present or next trial within practice or the other trials, from 1; trials: number of the others
     example: number of the example and of all; announced: the presentation that answers are about
     is_early: there was an answer before the stimulus had ended; answered: the answer that was noted last
-    is_begun: the participant was ready before
+    has_missed: there was no answer in time; is_last: no stimulus comes any more
+    is_correct, correct: feedback to the last answer; is_begun: the participant was ready before
+    texts: the sentences of the page by key
     """
 
     phase: Phase
     title: str
+    language: str
+    texts: dict[str, str]
+    instructions: str | None
     question: str
-    kind: Literal["choice", "magnitude"]
+    kind: Literal["choice", "magnitude", "number"]
     answers: tuple[str, ...]
+    labels: tuple[str, ...]
+    again: bool
+    questions: tuple[QuestionSection, ...]
+    is_practice: bool
     trial: int
     trials: int
+    has_missed: bool
+    is_last: bool
+    is_correct: bool | None
+    correct: str | None
     example: tuple[int, int] | None
     announced: PresentationKey | None
     is_early: bool
@@ -113,10 +136,12 @@ class TrialRow(JsonModel):
     trial: int
     attempt: int
     presentations: int
+    is_practice: bool
+    is_catch: bool
     condition: dict[str, Value]
-    answer: str | float
+    answer: str | float | None
     is_correct: bool | None
-    response_time_s: float
+    response_time_s: float | None
     response_latency_s: float | None
     early_answers: int | None
     pulses: int
@@ -128,7 +153,7 @@ class Executed(JsonModel):
 
     pulses: int
     duration_s: float
-    onset_s: float
+    onset_s: float | None
     fault: str | None
 
 
@@ -141,8 +166,10 @@ class OperatorView(JsonModel):
     phase: Phase
     title: str
     participant: str
-    pattern: str
-    parameters: dict[str, Value]
+    stimulus: str
+    block: str | None
+    is_practice: bool
+    is_catch: bool
     trial: int
     trials: int
     example: tuple[int, int] | None

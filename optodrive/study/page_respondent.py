@@ -17,6 +17,7 @@ state of its own, so one that was reloaded shows the same as before.
 """
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,7 @@ from optodrive.study.page_messages import (
     AgainMessage,
     AnswerMessage,
     Executed,
+    FormMessage,
     OperatorView,
     ParticipantView,
     Phase,
@@ -35,7 +37,9 @@ from optodrive.study.page_messages import (
 )
 from optodrive.study.presenter import Presentation
 from optodrive.study.session import RepeatReason, Respondent, Response
-from optodrive.study.study_file import Study, Value
+from optodrive.study.study_file import Study
+from optodrive.study.study_sections import QuestionSection, Value
+from optodrive.study.trial_list import ListedTrial
 
 INPUTS_MAX = 100
 """Answers that are kept from the announcement of a stimulus to its end. Further ones are dropped."""
@@ -60,19 +64,28 @@ class PageRespondent(Respondent):
 
     def __init__(self, study: Study, participant: str, trials: Mapping[int, Mapping[str, Any]]) -> None:
         self.on_change: Callable[[], None] = lambda: None
-        self._study, self._participant = study, participant
-        self._answered, self._correct = len(trials), sum(bool(record["is_correct"]) for record in trials.values())
+        self._study, self._participant, self._texts = study, participant, study.page_texts
+        counted = [record for record in trials.values() if record["phase"] == "main"]
+        self._answered, self._correct = len(counted), sum(bool(record["is_correct"]) for record in counted)
+        self._practised = len(trials) - len(counted)
+        self._is_practice = study.practice is not None and not counted
         self._rows = [_build_row(trials[index]) for index in sorted(trials)[-ROWS_MAX:]]
         self._changed = threading.Condition()
         self._connection = 0
         self._is_present = self._is_ready = self._is_begun = self._is_paused = False
         self._example: tuple[int, int] | None = None
         self._announced: PresentationKey | None = None
+        self._listed: ListedTrial | None = None
         self._condition: dict[str, Value] | None = None
+        self._instructions = study.instructions
+        self._questions: tuple[QuestionSection, ...] = ()
+        self._forms: list[dict[str, Any]] = []
+        self._feedback: tuple[bool | None, str | None] = (None, None)
         self._is_open = self._is_interrupted = False
         self._inputs: list[_Input] = []
         self._early_answers = 0
         self._noted: str | float | None = None
+        self._has_missed = self._is_last = False
         self._executed: Executed | None = None
         self._halt: str | None = None
         self._outcome: Phase | None = None
@@ -94,10 +107,45 @@ class PageRespondent(Respondent):
             self._example = number, count
             self._notify()
 
-    def announce(self, trial: int, attempt: int, presentation: int, condition: Mapping[str, Value]) -> None:
+    def instruct(self, text: str | None) -> None:
+        """Show instructions until the participant is ready."""
+        with self._changed:
+            self._instructions = text
+            self._notify()
+
+    def take_break(self, text: str | None) -> None:
+        """Let the participant rest, and wait for the button before the next stimulus."""
+        with self._changed:
+            self._instructions = text
+            self._interrupt()
+
+    def fill_in(self, questions: Sequence[QuestionSection]) -> dict[str, Any]:
+        """Show a questionnaire until it is answered. Raise StoppedError after STOP."""
+        with self._changed:
+            self._questions = tuple(questions)
+            self._forms.clear()
+            self._notify()
+            self._changed.wait_for(lambda: self._halt is not None or self._forms)
+            self._raise_if_halted()
+            self._questions = ()
+            self._notify()
+            return self._forms[0]
+
+    def show_feedback(self, is_correct: bool | None, correct: str | None) -> None:
+        """Show whether the last answer was correct until the next stimulus."""
+        with self._changed:
+            self._feedback = is_correct, correct
+            self._notify()
+
+    def announce(
+        self, trial: int, attempt: int, presentation: int, listed: ListedTrial, condition: Mapping[str, Value]
+    ) -> None:
         """Show that a trial's stimulus comes, and keep answers to it from now on."""
         with self._changed:
             self._announced = PresentationKey(trial=trial, attempt=attempt, presentation=presentation)
+            self._listed, self._is_practice = listed, listed.phase == "practice"
+            self._has_missed = self._is_last = False
+            self._feedback = None, None
             self._condition, self._executed, self._noted, self._example = dict(condition), None, None, None
             self._is_open, self._inputs = False, []
             self._is_interrupted = not self._is_ready
@@ -127,23 +175,36 @@ class PageRespondent(Respondent):
             self._inputs = [item for item in self._inputs if item.arrived_s >= end_s]
             self._is_open = True
             self._notify()
-            self._changed.wait_for(lambda: self._inputs or self._is_interrupted or self._halt is not None)
+            end_of_wait_s = None if (max_s := self._study.response.max_s) is None else end_s + max_s
+            self._changed.wait_for(
+                lambda: self._inputs or self._is_interrupted or self._halt is not None,
+                None if end_of_wait_s is None else max(0.0, end_of_wait_s - time.monotonic()),
+            )
             found = self._inputs[0] if self._inputs else None
+            if end_of_wait_s is not None and found is not None and found.arrived_s > end_of_wait_s:
+                found = None
             self._announced = None
             if found is not None and found.answer is not None:
-                self._noted = found.answer
+                self._noted, self._is_last = found.answer, self._is_last_of_all()
                 self._notify()
                 latency_s = None if found.latency_s is None else round(found.latency_s, 6)
                 return Response(found.answer, round(found.arrived_s - end_s, 6), latency_s, self._early_answers)
             self._raise_if_halted()
+            if found is None and not self._is_interrupted:
+                self._has_missed, self._is_last = True, self._is_last_of_all()
+                self._notify()
+                return Response(None, None, None, self._early_answers)
             self._notify()
             return RepeatReason.INTERRUPTED if found is None else RepeatReason.REQUESTED
 
     def record_trial(self, record: Mapping[str, Any]) -> None:
         """List a trial that counts."""
         with self._changed:
-            self._answered += 1
-            self._correct += bool(record["is_correct"])
+            if record["phase"] == "main":
+                self._answered += 1
+                self._correct += bool(record["is_correct"])
+            else:
+                self._practised += 1
             self._rows = [*self._rows, _build_row(record)][-ROWS_MAX:]
             self._notice = ""
             self._notify()
@@ -177,7 +238,7 @@ class PageRespondent(Respondent):
     def receive(
         self,
         connection: int,
-        message: AnswerMessage | AgainMessage | ReadyMessage,
+        message: AnswerMessage | AgainMessage | ReadyMessage | FormMessage,
         arrived_s: float,
         latency_s: float | None,
     ) -> None:
@@ -190,6 +251,10 @@ class PageRespondent(Respondent):
                     self._interrupt()
                 else:
                     self._is_ready = self._is_begun = True
+                    self._notify()
+            elif isinstance(message, FormMessage):
+                if self._questions and all(_is_answered(question, message.answers) for question in self._questions):
+                    self._forms.append({each.name: message.answers[each.name] for each in self._questions})
                     self._notify()
             elif self._accepts(message):
                 answer = message.answer if isinstance(message, AnswerMessage) else None
@@ -217,11 +282,22 @@ class PageRespondent(Respondent):
             return ParticipantView(
                 phase=self._find_phase(),
                 title=study.title,
+                language=study.language,
+                texts=self._texts,
+                instructions=self._instructions,
                 question=study.response.question,
                 kind=study.response.kind,
                 answers=study.response.answers,
+                labels=study.response.labels or study.response.answers,
+                again=study.response.again,
+                questions=self._questions,
+                is_practice=self._is_practice,
                 trial=self._find_trial_number(),
                 trials=study.trial_count,
+                has_missed=self._has_missed,
+                is_last=self._is_last,
+                is_correct=self._feedback[0],
+                correct=self._feedback[1],
                 example=self._example,
                 announced=None if self._is_interrupted else self._announced,
                 is_early=self._is_open and self._early_answers > 0,
@@ -237,13 +313,15 @@ class PageRespondent(Respondent):
                 phase=self._find_phase(),
                 title=study.title,
                 participant=self._participant,
-                pattern=study.stimulus.pattern,
-                parameters=dict(study.stimulus.parameters),
+                stimulus=study.stimulus.pattern or "frames",
+                block=None if self._listed is None else self._listed.block,
+                is_practice=self._is_practice,
+                is_catch=self._listed is not None and self._listed.is_catch,
                 trial=self._find_trial_number(),
                 trials=study.trial_count,
                 example=self._example,
                 answered=self._answered,
-                correct=None if study.response.correct_factor is None else self._correct,
+                correct=self._correct if study.response.rules else None,
                 is_present=self._is_present,
                 is_ready=self._is_ready,
                 is_paused=self._is_paused,
@@ -280,15 +358,17 @@ class PageRespondent(Respondent):
         ):
             return False
         if isinstance(message, AgainMessage):
-            return True
+            return self._study.response.again
         answers = self._study.response.answers
         if answers:
             return message.answer in answers
-        return isinstance(message.answer, float) and 0.0 < message.answer < 1.0
+        return isinstance(message.answer, float) and 0.0 < message.answer < self._study.response.number_max
 
     def _find_phase(self) -> Phase:
         if self._outcome is not None:
             return self._outcome
+        if self._questions:
+            return "form"
         if not self._is_ready:
             return "start"
         if self._announced is not None and not self._is_interrupted:
@@ -297,25 +377,42 @@ class PageRespondent(Respondent):
             return "example"
         return "pause" if self._is_paused else "rest"
 
+    def _is_last_of_all(self) -> bool:
+        """Return whether no stimulus comes after the present one, once it is answered."""
+        return not self._is_practice and self._answered + 1 == self._study.trial_count
+
     def _find_trial_number(self) -> int:
-        return (
-            min(self._answered + 1, self._study.trial_count) if self._announced is None else self._announced.trial + 1
-        )
+        """Return the number of the present or next trial within practice, or within the other trials."""
+        before = 0 if self._study.practice is None else self._study.practice.count_max
+        if self._announced is not None:
+            return self._announced.trial + 1 - (0 if self._is_practice else before)
+        if self._is_practice:
+            return self._practised + 1
+        return min(self._answered + 1, self._study.trial_count)
+
+
+def _is_answered(question: QuestionSection, answers: Mapping[str, str | float]) -> bool:
+    """Return whether a questionnaire has a valid answer to a question."""
+    answer = answers.get(question.name)
+    if question.kind == "number":
+        return isinstance(answer, float)
+    return isinstance(answer, str) and (answer in question.answers if question.answers else bool(answer.strip()))
 
 
 def _build_row(record: Mapping[str, Any]) -> TrialRow:
-    shown = record["presentations"][-1]["executed"]
-    ends_s: Sequence[float] = [a + b for a, b in zip(shown["start_s"], shown["width_s"], strict=True)]
+    shown = record["presentations"][-1]
     return TrialRow(
         trial=record["trial"] + 1,
         attempt=record["attempt"],
         presentations=len(record["presentations"]),
+        is_practice=record["phase"] == "practice",
+        is_catch=record["is_catch"],
         condition=record["condition"],
         answer=record["answer"],
         is_correct=record["is_correct"],
         response_time_s=record["response_time_s"],
         response_latency_s=record.get("response_latency_s"),
         early_answers=record.get("early_answers"),
-        pulses=len(shown["pixel"]),
-        duration_s=max(ends_s),
+        pulses=len(shown["executed"]["pixel"]),
+        duration_s=shown["duration_s"],
     )

@@ -3,7 +3,7 @@
 For a simulated participant a map states how much is left.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import log
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,8 +15,9 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.sensitivity_map import SensitivityMap, write_sensitivity_map
 from optodrive.study.matching import BOTH_THRESHOLDS
-from optodrive.study.session import build_matching_model, list_comparisons
-from optodrive.study.study_file import MatchingSection, Study, Value
+from optodrive.study.session import build_matching_model, build_threshold_model, list_answered, list_comparisons
+from optodrive.study.study_file import Study
+from optodrive.study.study_sections import MatchingSection, ProcedureSection, Value
 from optodrive.study.threshold import sum_binomial
 
 CONFIDENCE = 0.95
@@ -64,8 +65,33 @@ class Line(NamedTuple):
 
 
 def count_correct(records: Sequence[dict[str, Any]]) -> Accuracy:
-    """Count the correct answers of trials."""
-    return Accuracy(sum(bool(record["is_correct"]) for record in records), len(records))
+    """Count the correct answers of the trials that have a correct answer and are no catch trials."""
+    judged = [record for record in records if record["is_correct"] is not None and not record["is_catch"]]
+    return Accuracy(sum(record["is_correct"] for record in judged), len(judged))
+
+
+def list_thresholds(
+    study: Study, procedure: ProcedureSection, sessions: Mapping[str, Sequence[dict[str, Any]]]
+) -> dict[str, dict[str, Any]]:
+    """Return the threshold, or the equality, of each session and block by their names."""
+    found: dict[str, dict[str, Any]] = {}
+    blocks = study.block_list
+    for name, records in sessions.items():
+        for block in blocks:
+            answered = list_answered(procedure, [record for record in records if record["block"] == block.name])
+            key = name if len(blocks) == 1 else f"{name} {block.name}"
+            if procedure.equal_interval is None:
+                found[key] = build_threshold_model(study, procedure).estimate(answered)._asdict()
+            else:
+                found[key] = find_equality(procedure.levels, answered)
+    return found
+
+
+def find_equality(levels: Sequence[float], answered: Sequence[tuple[int, bool]]) -> dict[str, Any]:
+    """Return the geometric mean of the levels at the reversals after the first two, and the number of reversals."""
+    turns = [k for k in range(1, len(answered)) if answered[k][1] != answered[k - 1][1]]
+    used = [log(levels[answered[k][0]]) for k in turns[2:]] or [log(levels[level]) for level, _ in answered[-1:]]
+    return {"equality": float(np.exp(np.mean(used))) if used else float("nan"), "reversals": len(turns)}
 
 
 def fit_magnitudes(study: Study, sessions: Sequence[Sequence[dict[str, Any]]]) -> Line:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
-from math import ceil
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,12 @@ from optodrive.device.config import PixelLayout
 from optodrive.study.matching import Comparison, MatchingModel
 from optodrive.study.observers import Observer
 from optodrive.study.presenter import Presentation, Presenter
-from optodrive.study.study_file import MATCHING_ANSWERS, MatchingSection, ProcedureSection, Study, Value
-from optodrive.study.threshold import ThresholdModel, draw_constant_levels, select_staircase_level
+from optodrive.study.study_file import MATCHING_ANSWERS, Study
+from optodrive.study.study_sections import MatchingSection, ProcedureSection, QuestionSection, Value
+from optodrive.study.threshold import ThresholdModel, select_staircase_level
+from optodrive.study.trial_list import ListedTrial
 from optodrive.study.trial_log import TrialLog
+from optodrive.study.trial_stimulus import TrialStimulus, build_stimulus, find_chosen_interval, find_correct_answer
 
 ATTEMPTS_MAX = 5
 """Largest number of attempts at one trial within a run; a stimulus that always fails is a fault of the display."""
@@ -29,12 +31,13 @@ RESPONSE_MEDIAN_S, RESPONSE_SPREAD = 1.2, 0.35
 class Response:
     """A participant's answer and the time from the end of the stimulus to it.
 
+    Both None if there was none in time.
     latency_s: the part of that time which the way of the answer may have taken; early_answers: number of answers before
     the end of the stimulus, which do not count; both None if the respondent cannot tell
     """
 
-    answer: str | float
-    response_time_s: float
+    answer: str | float | None
+    response_time_s: float | None
     latency_s: float | None = None
     early_answers: int | None = None
 
@@ -57,8 +60,23 @@ class Respondent:
     def announce_example(self, number: int, count: int) -> None:
         """Tell that a stimulus without a question comes, `number` of `count`."""
 
-    def announce(self, trial: int, attempt: int, presentation: int, condition: Mapping[str, Value]) -> None:
+    def announce(
+        self, trial: int, attempt: int, presentation: int, listed: ListedTrial, condition: Mapping[str, Value]
+    ) -> None:
         """Tell that a trial's stimulus comes. presentation: its number within the attempt, from 1."""
+
+    def show_feedback(self, is_correct: bool | None, correct: str | None) -> None:
+        """Tell whether the answer was correct, and the correct one, if there is one."""
+
+    def instruct(self, text: str | None) -> None:
+        """Show instructions before the first stimulus of a run."""
+
+    def take_break(self, text: str | None) -> None:
+        """Offer a break, with the instructions of the next block."""
+
+    def fill_in(self, questions: Sequence[QuestionSection]) -> dict[str, Any]:
+        """Return the answers to a questionnaire, by the names of the questions."""
+        raise NotImplementedError
 
     def withdraw(self, fault: str) -> None:
         """Tell that the announced stimulus was not as requested: there is no question about it."""
@@ -69,45 +87,52 @@ class Respondent:
 
 
 class SimulatedRespondent(Respondent):
-    """A simulated participant. Its answers follow from the study's seed, its number, the trial and the attempt."""
+    """A simulated participant. Its answers follow from the study's seed, its number, the trial and the attempt.
 
-    def __init__(self, observer: Observer, seed: int, number: int, presenter: Presenter) -> None:
-        self._observer, self._entropy, self._presenter = observer, (seed, number), presenter
+    session: makes those of further sessions differ
+    """
+
+    def __init__(self, observer: Observer, seed: int, number: int, presenter: Presenter, session: int = 1) -> None:
+        self._observer, self._presenter = observer, presenter
+        self._entropy = (seed, number) if session == 1 else (seed, number, session)
+        self._max_s = observer.study.response.max_s
 
     def respond(self, shown: Presentation, trial: int, attempt: int) -> Response:
         """Return the answer after the time that it takes."""
         rng = np.random.default_rng((*self._entropy, trial, attempt))
         answer = self._observer.answer(shown, rng)
         response_time_s = round(RESPONSE_MEDIAN_S * float(np.exp(RESPONSE_SPREAD * rng.standard_normal())), 6)
+        if self._max_s is not None and response_time_s > self._max_s:
+            self._presenter.wait(self._max_s)
+            return Response(None, None)
         self._presenter.wait(response_time_s)
         return Response(answer, response_time_s)
 
-
-def draw_order(study: Study, participant: str) -> list[dict[str, Value]]:
-    """Return the conditions of a participant's trials in an order drawn from the study's seed.
-
-    Every condition comes as often, `repetitions` times or, in a procedure, to within one. The order is recorded in the
-    session's log, with the levels of constant stimuli.
-    """
-    seed, procedure = f"{study.seed} {participant}", study.procedure
-    repetitions = ceil(study.trial_count / len(study.conditions))
-    order = [dict(condition) for condition in study.conditions for _ in range(repetitions)]
-    random.Random(seed).shuffle(order)
-    order = order[: study.trial_count]
-    if procedure is None or procedure.kind != "constant":
-        return order
-    levels = draw_constant_levels(len(procedure.levels), procedure.trials, f"{seed} levels")
-    return [
-        {**condition, procedure.parameter: procedure.levels[level]}
-        for condition, level in zip(order, levels, strict=True)
-    ]
+    def fill_in(self, questions: Sequence[QuestionSection]) -> dict[str, Any]:
+        """Answer with the first of the answers, 0 and `simulated`."""
+        return {
+            question.name: question.answers[0]
+            if question.answers
+            else 0.0
+            if question.kind == "number"
+            else "simulated"
+            for question in questions
+        }
 
 
 def list_answered(procedure: ProcedureSection, records: Sequence[dict[str, Any]]) -> list[tuple[int, bool]]:
-    """Return level and correctness of trials, in order."""
+    """Return level and correctness of the answered trials of a procedure, in order, without practice and catch trials.
+
+    Where an equality is sought, an answer that names the interval counts as correct: it lowers the level.
+    """
+    name = procedure.equal_interval
     return [
-        (procedure.levels.index(record["condition"][procedure.parameter]), bool(record["is_correct"]))
+        (
+            procedure.levels.index(record["condition"][procedure.parameter]),
+            bool(record["is_correct"]) if name is None else record["chosen_interval"] == name,
+        )
         for record in records
+        if record["phase"] == "main" and not record["is_catch"] and record["answer"] is not None
     ]
 
 
@@ -125,16 +150,18 @@ def build_matching_model(matching: MatchingSection, layout: PixelLayout) -> Matc
 
 def choose_condition(study: Study, log: TrialLog, trial: int, matching: MatchingModel | None) -> dict[str, Value]:
     """Return a trial's condition, with the choice of a procedure or a matching by the answers so far."""
-    procedure, condition = study.procedure, log.order[trial]
+    procedure, listed = study.procedure, log.order[trial]
+    condition = dict(listed.condition)
     if matching is not None:
         answers = list_comparisons([log.trials[index] for index in sorted(log.trials)])
         is_swapped = random.Random(f"{study.seed} {trial}").random() < 0.5
         return dict(matching.choose(answers, is_swapped)._asdict())
-    if procedure is None or procedure.kind == "constant":
+    if procedure is None or procedure.parameter in condition:
         return condition
-    answered = list_answered(procedure, [log.trials[index] for index in sorted(log.trials)])
+    records = [log.trials[index] for index in sorted(log.trials)]
+    answered = list_answered(procedure, [record for record in records if record["block"] == listed.block])
     if procedure.kind == "staircase":
-        level = select_staircase_level(len(procedure.levels), answered)
+        level = select_staircase_level(len(procedure.levels), answered, procedure.down)
     else:
         level = build_threshold_model(study, procedure).select_informative_level(answered)
     return {**condition, procedure.parameter: procedure.levels[level]}
@@ -163,11 +190,43 @@ def run_session(
     on_trial: gets the record of each trial; matching: of a study that has one, for its display. Raise an
     OptodriveError if the display cannot show a stimulus; the session can go on later.
     """
+    first = log.next_trial
+    texts = (study.instructions, None if first is None else find_instructions(study, log.order[first]))
+    respondent.instruct("\n\n".join(filter(None, texts)) or None)
+    _ask(study, log, respondent, "before")
     if study.familiarisation and not log.is_familiarised:
         log.record_familiarisation(_familiarise(study, presenter, respondent))
-    while (trial := log.next_trial) is not None:
-        on_trial(_run_trial(study, log, presenter, respondent, trial, matching))
+    before, since_break = None, 0
+    while (index := log.next_trial) is not None:
+        listed = log.order[index]
+        if before is not None and listed.block != before.block:
+            respondent.take_break(find_instructions(study, listed))
+            since_break = 0
+        elif study.break_every is not None and since_break == study.break_every:
+            respondent.take_break(None)
+            since_break = 0
+        record = _run_trial(study, log, presenter, respondent, index, matching)
+        on_trial(record)
+        practice = study.practice if listed.phase == "practice" else None
+        if study.response.feedback if practice is None else practice.feedback:
+            respondent.show_feedback(record["is_correct"], record["correct_answer"])
         presenter.wait(study.pause_s)
+        before, since_break = listed, since_break + 1
+    _ask(study, log, respondent, "after")
+
+
+def _ask(study: Study, log: TrialLog, respondent: Respondent, when: str) -> None:
+    """Ask the questionnaire unless it is answered."""
+    questions = [question for question in study.questions if question.when == when]
+    if questions and when not in log.answers:
+        log.record_answers(when, respondent.fill_in(questions))
+
+
+def find_instructions(study: Study, listed: ListedTrial) -> str | None:
+    """Return the text that is shown before the block of a trial."""
+    if listed.phase == "practice":
+        return None if study.practice is None else study.practice.instructions
+    return next((block.instructions for block in study.block_list if block.name == listed.block), None)
 
 
 def _familiarise(study: Study, presenter: Presenter, respondent: Respondent) -> list[dict[str, Any]]:
@@ -178,7 +237,8 @@ def _familiarise(study: Study, presenter: Presenter, respondent: Respondent) -> 
         condition = {**factors, **strongest}
         respondent.wait_until_ready()
         respondent.announce_example(number, len(study.conditions))
-        shown = presenter.present(study.stimulus.pattern, {**study.stimulus.parameters, **condition})
+        example = ListedTrial("examples", "practice", False, condition, study.interval_names)
+        shown = presenter.present(build_stimulus(study, example, condition, presenter.config))
         records.append({"condition": condition, **shown.to_record()})
         respondent.wait_until_ready()  # shows that the example is over
         presenter.wait(study.pause_s)
@@ -194,21 +254,21 @@ def _run_trial(
     matching: MatchingModel | None,
 ) -> dict[str, Any]:
     """Run one trial until it counts and return its record."""
-    condition = choose_condition(study, log, trial, matching)
-    parameters = {**study.stimulus.parameters, **condition}
+    listed, condition = log.order[trial], choose_condition(study, log, trial, matching)
+    stimulus = build_stimulus(study, listed, condition, presenter.config)
     for _ in range(ATTEMPTS_MAX):
         respondent.wait_until_ready()  # before the trial is begun: it is not interrupted while nobody is there
         attempt = log.begin(trial, condition)
         presentations: list[dict[str, Any]] = []
         while True:
-            respondent.announce(trial, attempt, len(presentations) + 1, condition)
-            shown = presenter.present(study.stimulus.pattern, parameters)
+            respondent.announce(trial, attempt, len(presentations) + 1, listed, condition)
+            shown = presenter.present(stimulus)
             if shown.fault is not None:
                 break
             response = respondent.respond(shown, trial, attempt)
             if isinstance(response, Response):
                 presentations.append(shown.to_record())
-                return log.complete(_build_record(study, condition, parameters, presentations, response))
+                return log.complete(_build_record(study, listed, condition, stimulus, presentations, response))
             presentations.append({**shown.to_record(), "repeated": response.value})
             respondent.wait_until_ready()
         log.spoil(shown.fault)
@@ -218,18 +278,20 @@ def _run_trial(
 
 def _build_record(
     study: Study,
+    listed: ListedTrial,
     condition: dict[str, Value],
-    parameters: dict[str, Value],
+    stimulus: TrialStimulus,
     presentations: list[dict[str, Any]],
     response: Response,
 ) -> dict[str, Any]:
-    correct = study.find_correct_answer(condition)
+    correct = find_correct_answer(study, listed, condition)
     return {
-        "requested": {"pattern": study.stimulus.pattern, "parameters": parameters},
+        "requested": stimulus.requested,
         "presentations": presentations,
         "answer": response.answer,
+        "chosen_interval": find_chosen_interval(study, listed, response.answer),
         "correct_answer": correct,
-        "is_correct": None if correct is None else response.answer == correct,
+        "is_correct": None if correct is None or response.answer is None else response.answer == correct,
         "response_time_s": response.response_time_s,
         "response_latency_s": response.latency_s,
         "early_answers": response.early_answers,

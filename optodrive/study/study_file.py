@@ -1,37 +1,56 @@
 """Study files: the design of an experiment with people, as TOML of a stated version."""
 
 import re
-from collections.abc import Mapping
-from itertools import pairwise, product
-from math import isclose
+from collections.abc import Iterator, Mapping
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted, suggest_nearest
+from optodrive.core.files import read_bounded
 from optodrive.core.toml_model import ConflictError, Name, Section, check_format, parse_table, read_toml
-from optodrive.study.threshold import Procedure
+from optodrive.planning.stimuli.json_values import decode_json
+from optodrive.study.page_texts import TEXTS, check_text
+from optodrive.study.study_sections import (
+    BlockSection,
+    CatchSection,
+    Factors,
+    IntervalSection,
+    MatchingSection,
+    OrderSection,
+    PracticeSection,
+    ProcedureSection,
+    PublishedSection,
+    QuestionSection,
+    ResponseSection,
+    SimulationSection,
+    StimulusSection,
+    Text,
+    Value,
+)
 
-FORMAT, VERSION = "optodrive-study", 1
+FORMAT, VERSION = "optodrive-study", 2
 EXPERIMENTS = Path(__file__).with_name("experiments")
 SIMULATED_PREFIX = "sim"
 """Beginning of the identifiers of simulated participants."""
 TRIALS_MAX = 10_000
-CHANCE_TOLERANCE = 1e-3
 MATCHING_ANSWERS = ("first", "second")
 OBSERVER_ANSWERS: dict[str, tuple[str, ...]] = {
     "linear-motion": ("left", "right", "up", "down"),
     "rotation": ("cw", "ccw"),
     "localisation": tuple("123456789"),
     "detection": ("left", "right"),
+    "motion": ("motion", "succession"),
 }
 """All answers of the observers that name what they feel. The others number the parts of a stimulus, or rate it."""
 MAGNITUDE_OBSERVER = "intensity"
 MATCHED_PARAMETERS = ("first", "second", "first_intensity", "second_intensity")
 """Parameters of the stimulus of a matching, which vary between trials."""
+GAP = "gap_s"
+"""The factor, or parameter of a procedure, that is the time between two intervals."""
 
-Value = str | int | float
 Condition = Mapping[str, Value]
 """One value of each factor."""
 
@@ -42,105 +61,11 @@ def _require_task_name(text: str) -> str:
     return text
 
 
-class StimulusSection(Section):
-    """The stimulus of every trial."""
-
-    pattern: Name
-    """A name that `optodrive patterns` lists; the factors are parameters of it."""
-    parameters: dict[str, Value] = Field(default_factory=dict)
-    """Parameters with the same value in every trial."""
-
-
-class ResponseSection(Section):
-    """The participant's response."""
-
-    kind: Literal["choice", "magnitude"]
-    """One of the answers, or a number between 0 and 1, both excluded, on a scale."""
-    question: Name
-    answers: tuple[Name, ...] = ()
-    correct_factor: Name | None = None
-    """The factor whose value is the correct answer."""
-    chance_level: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
-    """Share of correct answers by guessing; states the design's, and is checked."""
-
-    @model_validator(mode="after")
-    def _check_answers(self) -> "ResponseSection":
-        if self.kind == "magnitude":
-            if self.answers or self.correct_factor or self.chance_level:
-                raise ConflictError("answers", self.answers, "none, no correct_factor and no chance_level: a magnitude")
-            return self
-        if len(set(self.answers)) != len(self.answers) or len(self.answers) < 2:
-            raise ConflictError("answers", self.answers, "at least two, all different")
-        if self.chance_level is None or not isclose(
-            self.chance_level, 1.0 / len(self.answers), abs_tol=CHANCE_TOLERANCE
-        ):
-            expected = f"{1.0 / len(self.answers):.4f}, for one of {len(self.answers)} answers"
-            raise ConflictError("chance_level", self.chance_level, expected)
-        return self
-
-
-class ProcedureSection(Section):
-    """The choice of a level for each trial, to find the threshold of a parameter."""
-
-    kind: Procedure
-    """Every level as often, 1 up and 2 down, or the most informative level next."""
-    parameter: Name
-    """The pattern's parameter whose threshold is sought."""
-    levels: Annotated[tuple[Annotated[float, Field(gt=0.0)], ...], Field(min_length=3, max_length=100)]
-    """Values of the parameter in increasing order."""
-    trials: Annotated[int, Field(ge=1, le=1000)]
-
-    @model_validator(mode="after")
-    def _check_levels(self) -> "ProcedureSection":
-        if any(low >= high for low, high in pairwise(self.levels)):
-            raise ConflictError("levels", self.levels, "increasing values")
-        return self
-
-
-class MatchingSection(Section):
-    """Comparisons of places, chosen by the answers so far, by which the sensitivity over the display is found."""
-
-    trials: Annotated[int, Field(ge=1, le=5000)]
-    places: Annotated[int, Field(ge=2, le=200)] = 60
-    """Number of compared pixels, spread over the display."""
-    intensity: Annotated[float, Field(gt=0.0, le=100.0)]
-    """Perceived intensity at which they are compared, in thresholds."""
-
-
-class SimulationSection(Section):
-    """The simulated participant."""
-
-    observer: Literal[
-        "linear-motion", "rotation", "localisation", "intensity", "oddball", "digits", "detection", "comparison"
-    ]
-    """The rule by which it answers."""
-    sensitivity_range: Annotated[float, Field(ge=1.0, le=10.0)] = 1.0
-    """Largest over smallest sensitivity over the display, which varies smoothly and differs between participants."""
-
-
-class PublishedSection(Section):
-    """Results that a paper states for this design."""
-
-    source: Name
-    participants: Annotated[int, Field(ge=1)]
-    trials_per_participant: Annotated[int, Field(ge=1)]
-    correct: Annotated[int, Field(ge=0)] | None = None
-    """Correct answers of all participants together."""
-    r_squared: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
-    contradictions: tuple[str, ...] = ()
-    """Places at which the source contradicts itself."""
-
-    @property
-    def trials(self) -> int:
-        """Trials of all participants together."""
-        return self.participants * self.trials_per_participant
-
-
 class Study(Section):
     """Design of an experiment: conditions, repetitions, order and responses."""
 
     format: Literal["optodrive-study"]
-    version: Literal[1]
+    version: Literal[2]
     name: Annotated[str, Field(max_length=60), AfterValidator(_require_task_name)]
     """Small letters, digits and hyphens; the task of the dataset is the name without hyphens."""
     title: Name
@@ -148,62 +73,179 @@ class Study(Section):
     """Seed of the orders of trials; each participant's is recorded in the session's log."""
     repetitions: Annotated[int, Field(ge=1, le=1000)] = 1
     """Number of trials with each condition; a procedure states its own number of trials."""
+    sessions: Annotated[int, Field(ge=1, le=99)] = 1
+    """Number of sessions of each participant, such as on several days."""
     pause_s: Annotated[float, Field(ge=0.0, le=600.0)]
     """Time from an answer to the next stimulus."""
     familiarisation: bool = False
     """Whether each stimulus is shown once, without a response, before the first trial."""
-    stimulus: StimulusSection
-    factors: dict[str, Annotated[tuple[Value, ...], Field(min_length=1)]] = Field(default_factory=dict)
+    break_every: Annotated[int, Field(ge=1, le=1000)] | None = None
+    """Number of trials after which the participant is offered a break."""
+    language: Annotated[str, Field(pattern=r"^[a-z]{2,3}(-[A-Za-z0-9]{2,8})*$")] = "en"
+    """Language of the page, such as `de`."""
+    instructions: Text | None = None
+    """Shown before the first stimulus."""
+    texts: dict[str, Text] = Field(default_factory=dict)
+    """Sentences of the page in place of its own, as a translation."""
+    stimulus: StimulusSection = Field(default_factory=StimulusSection)
+    """What every trial shows."""
+    intervals: Annotated[tuple[IntervalSection, ...], Field(max_length=10)] = ()
+    """The parts of a trial, one after the other; none: one part."""
+    factors: Factors = Field(default_factory=dict)
     """Values of each factor; the conditions are their combinations."""
+    levels: dict[str, dict[str, StimulusSection]] = Field(default_factory=dict)
+    """What the values of a factor that is no parameter change, by factor and value."""
+    order: OrderSection = Field(default_factory=OrderSection)
+    blocks: Annotated[tuple[BlockSection, ...], Field(max_length=100)] = ()
+    catch: CatchSection | None = None
+    practice: PracticeSection | None = None
     response: ResponseSection
     procedure: ProcedureSection | None = None
     matching: MatchingSection | None = None
+    questions: Annotated[tuple[QuestionSection, ...], Field(max_length=30)] = ()
+    """A questionnaire of a few fields."""
     simulation: SimulationSection | None = None
     published: PublishedSection | None = None
 
     @model_validator(mode="after")
-    def _check_factors(self) -> "Study":
+    def _check_design(self) -> "Study":
         if self.matching is not None:
             self._check_matching()
-        elif not self.factors:
-            raise ConflictError("factors", self.factors, "at least one factor")
-        for name, values in self.factors.items():
-            if len(set(map(repr, values))) != len(values):
-                raise ConflictError(f"factors.{name}", values, "values that differ")
-            if name in self.stimulus.parameters:
-                raise ConflictError(f"factors.{name}", values, "a factor that is no parameter of the stimulus too")
-        correct = self.response.correct_factor
-        if correct is not None:
-            if correct not in self.factors:
-                raise ConflictError("response.correct_factor", correct, f"one of {', '.join(self.factors)}")
-            for value in self.factors[correct]:
-                if str(value) not in self.response.answers:
-                    raise ConflictError(f"factors.{correct}", value, "one of the answers")
+        self._check_factors()
+        self._check_blocks()
+        self._check_answer()
         if self.procedure is not None:
-            if correct is None:
-                raise ConflictError("response.correct_factor", correct, "a factor: a threshold needs correct answers")
-            if self.procedure.parameter in {**self.factors, **self.stimulus.parameters}:
-                raise ConflictError("procedure.parameter", self.procedure.parameter, "neither a factor nor a constant")
-            if self.repetitions != 1:
-                raise ConflictError("repetitions", self.repetitions, "none: the procedure states the number of trials")
+            self._check_procedure(self.procedure)
         if self.trial_count > TRIALS_MAX:
             raise ConflictError("repetitions", self.repetitions, f"at most {TRIALS_MAX} trials in all")
+        names = [question.name for question in self.questions]
+        if len(set(names)) < len(names):
+            raise ConflictError("questions", names, "names that differ")
+        for key, text in self.texts.items():
+            check_text(key, text)
         self._check_observer()
         return self
+
+    def _list_factors(self) -> Iterator[tuple[str, str, tuple[Value, ...]]]:
+        """Yield place, name and values of every list of a factor's values."""
+        for name, values in self.factors.items():
+            yield f"factors.{name}", name, values
+        for index, block in enumerate(self.blocks):
+            for name, values in block.factors.items():
+                yield f"blocks.{index}.factors.{name}", name, values
+        for name, values in (self.practice.factors if self.practice else {}).items():
+            yield f"practice.factors.{name}", name, values
+
+    def _check_factors(self) -> None:
+        known = {name for place, name, _ in self._list_factors() if not place.startswith("practice")}
+        for place, name, values in self._list_factors():
+            if len(set(map(repr, values))) != len(values):
+                raise ConflictError(place, values, "values that differ")
+            if name in self.stimulus.parameters:
+                raise ConflictError(place, values, "a factor that is no parameter of the stimulus too")
+            is_level = self.procedure is not None and name == self.procedure.parameter
+            if place.startswith("practice") and name not in known and not is_level:
+                raise ConflictError(place, values, "a factor of the study")
+            if name == GAP and not all(isinstance(value, int | float) and 0.0 <= value <= 60.0 for value in values):
+                raise ConflictError(place, values, "times from 0 to 60 s")
+        for factor, levels in self.levels.items():
+            texts = [str(value) for _, name, listed in self._list_factors() if name == factor for value in listed]
+            if not texts:
+                raise ConflictError(f"levels.{factor}", factor, f"a factor, {suggest_nearest(factor, sorted(known))}")
+            for level in levels:
+                if level not in texts:
+                    raise ConflictError(f"levels.{factor}", level, f"a value of the factor: {', '.join(texts)}")
+        is_shown = self.stimulus.pattern is not None or self.stimulus.frames is not None
+        others = [*self.intervals, *(level for levels in self.levels.values() for level in levels.values())]
+        if not is_shown and not any(each.pattern is not None or each.frames is not None for each in others):
+            raise ConflictError("stimulus.pattern", None, "a pattern, or frames")
+
+    def _check_blocks(self) -> None:
+        names = [block.name for block in self.blocks]
+        if len(set(names)) < len(names):
+            raise ConflictError("blocks", names, "names that differ")
+        by = self.order.blocked_by
+        if by is not None:
+            if by not in self.factors:
+                expected = f"a factor, {suggest_nearest(by, list(self.factors))}" if self.factors else "no factor"
+                raise ConflictError("order.blocked_by", by, expected)
+            if self.blocks:
+                raise ConflictError("blocks", names, "none beside order.blocked_by, which makes the blocks")
+        if self.order.trials == "latin-square" and self.procedure is not None:
+            raise ConflictError("order.trials", self.order.trials, "random or fixed, beside a procedure")
+        names = [interval.name for interval in self.intervals]
+        if len(set(names)) < len(names):
+            raise ConflictError("intervals", names, "names that differ, with count for several alike")
+        if self.order.intervals == "random" and len(self.interval_names) < 2:
+            raise ConflictError("order.intervals", self.order.intervals, "at least two intervals")
+        if self.catch is not None:
+            if self.catch.shows != "nothing" and self.catch.shows not in names:
+                raise ConflictError("catch.shows", self.catch.shows, f"one of {', '.join(['nothing', *names])}")
+            if self.catch.answer is not None and self.catch.answer not in self.response.answers:
+                raise ConflictError("catch.answer", self.catch.answer, "one of the answers")
+            if self.catch.errors_max is not None and self.catch.answer is None:
+                raise ConflictError("catch.errors_max", self.catch.errors_max, "a catch.answer beside it")
+        if self.practice is not None and self.practice.criterion is not None and not self.response.rules:
+            raise ConflictError("practice.criterion", self.practice.criterion, "none: no answer is correct")
+
+    def _check_answer(self) -> None:
+        """Raise ConflictError for a rule of the correct answer that the study cannot follow."""
+        response, names = self.response, self.interval_names
+        is_equality = self.procedure is not None and self.procedure.equal_interval is not None
+        if (response.is_by_place or is_equality) and len(response.answers) != len(names):
+            raise ConflictError("response.answers", response.answers, f"one per interval, {len(names)} in order")
+        if response.correct_interval is not None and names.count(response.correct_interval) != 1:
+            raise ConflictError("response.correct_interval", response.correct_interval, f"one of {', '.join(names)}")
+        if response.correct_position is not None:
+            if response.correct_position > len(names):
+                raise ConflictError("response.correct_position", response.correct_position, f"1 to {len(names)}")
+            for name in names:
+                if name not in response.answers:
+                    raise ConflictError("intervals", name, "one of the answers")
+        correct = response.correct_factor
+        if correct is None:
+            return
+        listed = [(place, values) for place, name, values in self._list_factors() if name == correct]
+        if not listed:
+            known = dict.fromkeys(name for _, name, _ in self._list_factors())
+            raise ConflictError("response.correct_factor", correct, f"one of {', '.join(known)}")
+        for place, values in listed:
+            for value in values:
+                if str(value) not in response.answers:
+                    raise ConflictError(place, value, "one of the answers")
+
+    def _check_procedure(self, procedure: ProcedureSection) -> None:
+        if procedure.equal_interval is not None:
+            if self.response.rules or self.interval_names.count(procedure.equal_interval) != 1:
+                expected = f"one of {', '.join(self.interval_names)}, without a correct answer"
+                raise ConflictError("procedure.equal_interval", procedure.equal_interval, expected)
+        elif not self.response.rules:
+            raise ConflictError("response.correct_factor", None, "a factor: a threshold needs correct answers")
+        names = {name for place, name, _ in self._list_factors() if not place.startswith("practice")}
+        if procedure.parameter in {*names, *self.stimulus.parameters}:
+            raise ConflictError("procedure.parameter", procedure.parameter, "neither a factor nor a constant")
+        if self.repetitions != 1:
+            raise ConflictError("repetitions", self.repetitions, "none: the procedure states the number of trials")
 
     def _check_observer(self) -> None:
         """Raise ConflictError for a simulated participant that cannot give the study's answers."""
         if self.simulation is None:
             return
         observer, answers = self.simulation.observer, self.response.answers
-        if (observer == MAGNITUDE_OBSERVER) != (self.response.kind == "magnitude"):
-            given = "magnitudes" if self.response.kind == "magnitude" else ", ".join(answers)
+        if (observer == MAGNITUDE_OBSERVER) != (self.response.kind != "choice"):
+            given = "magnitudes" if self.response.kind != "choice" else ", ".join(answers)
             raise ConflictError("simulation.observer", observer, f"an observer whose answers are {given}")
-        possible = OBSERVER_ANSWERS.get(observer, answers)
-        if not set(answers) <= set(possible):
+        if observer == "interval" and len(answers) != max(1, len(self.interval_names)):
             expected = (
-                f"an observer whose answers are {', '.join(answers)}; those of this one are {', '.join(possible)}"
+                f"another: it names one of {len(self.interval_names)} intervals, the study has {len(answers)} answers"
             )
+            raise ConflictError("simulation.observer", observer, expected)
+        possible = self.interval_names if observer == "order" else OBSERVER_ANSWERS.get(observer, answers)
+        if observer == "identification":
+            possible = tuple(map(str, self.factors.get(self.response.correct_factor or "", ())))
+        if not set(answers) <= set(possible):
+            own = ", ".join(possible) or "none here"
+            expected = f"an observer whose answers are {', '.join(answers)}; those of this one are {own}"
             raise ConflictError("simulation.observer", observer, expected)
 
     def _check_matching(self) -> None:
@@ -211,37 +253,90 @@ class Study(Section):
             raise ConflictError("factors", self.factors, "none: the answers choose the comparisons")
         if self.stimulus.pattern != "comparison" or self.stimulus.parameters:
             raise ConflictError("stimulus", self.stimulus.pattern, "the pattern comparison without parameters")
-        if self.response.answers != MATCHING_ANSWERS or self.response.correct_factor is not None:
-            expected = f"{', '.join(MATCHING_ANSWERS)}, without a correct_factor"
+        if self.response.answers != MATCHING_ANSWERS or self.response.rules:
+            expected = f"{', '.join(MATCHING_ANSWERS)}, without a correct answer"
             raise ConflictError("response.answers", self.response.answers, expected)
-        if self.procedure is not None:
-            raise ConflictError("procedure", self.procedure.kind, "none beside [matching]")
+        for key in ("procedure", "catch", "practice", "blocks", "intervals"):
+            if getattr(self, key):
+                raise ConflictError(key, Unquoted("a section"), "none beside [matching]")
         if self.repetitions != 1:
             raise ConflictError("repetitions", self.repetitions, "none: [matching] states the number of trials")
 
     @property
-    def conditions(self) -> tuple[dict[str, Value], ...]:
-        """All combinations of the factors' values, the last factor fastest."""
-        return tuple(dict(zip(self.factors, values, strict=True)) for values in product(*self.factors.values()))
+    def interval_names(self) -> tuple[str, ...]:
+        """Name of every interval of a trial, in the order of the file."""
+        return tuple(interval.name for interval in self.intervals for _ in range(interval.count))
 
     @property
-    def trial_count(self) -> int:
-        """Number of trials of one participant."""
+    def block_list(self) -> tuple[BlockSection, ...]:
+        """The blocks in the order of the file: as stated, one per value of the blocking factor, or a single one."""
+        by = self.order.blocked_by
+        if by is not None:
+            return tuple(
+                BlockSection.model_construct(
+                    name=f"{by}-{value}", factors={by: (value,)}, repetitions=None, instructions=None
+                )
+                for value in self.factors[by]
+            )
+        return self.blocks or (
+            BlockSection.model_construct(name="main", factors={}, repetitions=None, instructions=None),
+        )
+
+    def list_conditions(self, block: BlockSection | None = None) -> tuple[dict[str, Value], ...]:
+        """Return all combinations of the factors' values in a block, the last factor fastest."""
+        factors = {**self.factors, **(block.factors if block else {})}
+        return tuple(dict(zip(factors, values, strict=True)) for values in product(*factors.values()))
+
+    @property
+    def conditions(self) -> tuple[dict[str, Value], ...]:
+        """All conditions of all blocks, each once."""
+        found = [condition for block in self.block_list for condition in self.list_conditions(block)]
+        return tuple({repr(condition): condition for condition in found}.values())
+
+    @property
+    def varied(self) -> dict[str, tuple[Value, ...]]:
+        """Values of each parameter that varies between trials, none of one that is chosen freely."""
+        found: dict[str, dict[Value, None]] = {}
+        for _, name, values in self._list_factors():
+            found.setdefault(name, {}).update(dict.fromkeys(values))
+        listed = {name: tuple(values) for name, values in found.items()}
+        if self.procedure is not None:
+            listed[self.procedure.parameter] = self.procedure.levels
+        return listed | (dict.fromkeys(MATCHED_PARAMETERS, ()) if self.matching is not None else {})
+
+    @property
+    def tabulated(self) -> dict[str, tuple[Value, ...]]:
+        """Values of each parameter of the table of trials: those that vary, and constants that no interval changes."""
+        changed = {name for interval in self.intervals for name in interval.parameters}
+        changed |= {name for levels in self.levels.values() for level in levels.values() for name in level.parameters}
+        constants = {name: (value,) for name, value in self.stimulus.parameters.items() if name not in changed}
+        return {**self.varied, **constants}
+
+    def count_trials(self, block: BlockSection) -> int:
+        """Return the number of trials of a block, without catch trials."""
         if self.procedure is not None:
             return self.procedure.trials
         if self.matching is not None:
             return self.matching.trials
-        return len(self.conditions) * self.repetitions
+        repetitions = self.repetitions if block.repetitions is None else block.repetitions
+        return len(self.list_conditions(block)) * repetitions
+
+    @property
+    def trial_count(self) -> int:
+        """Number of trials of one session, with catch trials and without practice."""
+        blocks = self.block_list
+        catch = 0 if self.catch is None else self.catch.trials * len(blocks)
+        return sum(map(self.count_trials, blocks)) + catch
 
     @property
     def task(self) -> str:
         """Name of the task in a dataset, which has letters and digits only."""
         return self.name.replace("-", "")
 
-    def find_correct_answer(self, condition: Condition) -> str | None:
-        """Return the correct answer in a condition, None if no answer is."""
-        factor = self.response.correct_factor
-        return None if factor is None else str(condition[factor])
+    @property
+    def page_texts(self) -> dict[str, str]:
+        """Every sentence of the page, by key."""
+        return {**TEXTS, **self.texts}
 
 
 def list_shipped_studies() -> list[str]:
@@ -250,11 +345,26 @@ def list_shipped_studies() -> list[str]:
 
 
 def load_study(source: str) -> Study:
-    """Read a study file, or a shipped one by its name. Raise InputError with one line."""
+    """Read a study file with its frames, or a shipped one by its name. Raise InputError with one line."""
     names = list_shipped_studies()
     path = EXPERIMENTS / f"{source}.toml" if source in names else Path(source)
     if not path.is_file():
         raise InputError("study", source, "a file, or " + ", ".join(names))
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
+    _read_frames(path, "", table)
     return parse_table(path, table, Study)
+
+
+def _read_frames(path: Path, place: str, table: Any) -> None:
+    """Replace every path of a FRAMES.json by its content."""
+    items = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
+    for key, value in items:
+        where = f"{place}.{key}" if place else str(key)
+        if key == "frames" and isinstance(value, str):
+            content = decode_json(read_bounded(path.parent / value), value)
+            if not isinstance(content, dict):
+                raise InputError(f"{path}: {where}", value, "a FRAMES.json, which is an object")
+            table[key] = content
+        elif key != "parameters":
+            _read_frames(path, where, value)

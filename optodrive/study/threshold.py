@@ -45,7 +45,6 @@ GUESSING_MAX = 0.01
 CORRECT_MAX = 1.0 - 1e-9
 """Largest probability of a correct answer, which no error contradicts altogether."""
 TAIL = 0.025
-STAIRCASE_DOWN = 2
 
 
 class ThresholdEstimate(NamedTuple):
@@ -157,8 +156,8 @@ def draw_constant_levels(level_count: int, trials: int, seed: str) -> list[int]:
     return order
 
 
-def select_staircase_level(level_count: int, answered: Answered) -> int:
-    """Return the next level of a staircase with one up and two down that starts at the highest level.
+def select_staircase_level(level_count: int, answered: Answered, down: int = 2) -> int:
+    """Return the next level of a staircase with one up and `down` down that starts at the highest level.
 
     Until its first error it goes down after each correct answer, which brings it near the threshold.
     """
@@ -168,6 +167,6 @@ def select_staircase_level(level_count: int, answered: Answered) -> int:
             level, run, has_erred = min(level + 1, level_count - 1), 0, True
             continue
         run += 1
-        if run == STAIRCASE_DOWN or not has_erred:
+        if run == down or not has_erred:
             level, run = max(level - 1, 0), 0
     return level

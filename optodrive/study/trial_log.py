@@ -8,7 +8,7 @@ second line alone makes a trial count, so that a process may end at any instant:
 - after `begun`: the stimulus may have been shown. The next run appends `interrupted`, and the trial is repeated as its
   next attempt, which its line states.
 - within a line: the line has no end. It never counted; the next run removes it, and the case above applies.
-- after `trial`: it counts, once. The order of trials stands in the first line, never computed anew.
+- after `trial`: it counts, once. The list of trials stands in the first line, never computed anew.
 
 A lock on the file keeps a second process from appending to the same session.
 """
@@ -23,9 +23,11 @@ from types import TracebackType
 from typing import Any, Self
 
 from optodrive.core.errors import BusyError, InputError, Unquoted, refuse_os_error
-from optodrive.study.study_file import SIMULATED_PREFIX, Study, Value
+from optodrive.study.study_file import SIMULATED_PREFIX, Study
+from optodrive.study.study_sections import Value
+from optodrive.study.trial_list import ListedTrial, is_practice_over, list_trials
 
-FORMAT, VERSION = "optodrive-trials", 1
+FORMAT, VERSION = "optodrive-trials", 2
 LOG_BYTES_MAX = 500_000_000
 SHOWN = frozenset({"familiarised", "begun"})
 """Kinds of records after which a participant may have felt something."""
@@ -34,12 +36,12 @@ SHOWN = frozenset({"familiarised", "begun"})
 class TrialLog:
     """Log of one participant's session, as a context manager.
 
-    order: the conditions of all trials; trials: the records of those that count, by their index
-    run: number of the present run of the session, from 1
+    order: the list of trials; trials: the records of those that count, by their index
+    run: number of the present run of the session, from 1; answers: to the questionnaire, by `before` and `after`
     """
 
-    def __init__(self, path: Path, study: Study, participant: str, order: Sequence[Mapping[str, Value]]) -> None:
-        """Open or create the log. `order` is recorded in a new log, and ignored for one that exists.
+    def __init__(self, path: Path, study: Study, participant: str, session: int = 1) -> None:
+        """Open or create the log. The list of trials is recorded in a new log, and read from one that exists.
 
         A log of a changed study begins anew before the first stimulus, or a simulated participant's first answer.
         Raise InputError for a log of another study or participant, or one that is damaged; BusyError if another process
@@ -49,6 +51,8 @@ class TrialLog:
         self.trials: dict[int, dict[str, Any]] = {}
         self.is_familiarised = False
         self.run = 0
+        self.answers: dict[str, dict[str, Any]] = {}
+        self._study = study
         self._attempts: dict[int, int] = {}
         self._open_trial: int | None = None
         self._condition: dict[str, Value] = {}
@@ -60,12 +64,12 @@ class TrialLog:
                 self._file.truncate(0)
                 records = []
             if not records:
-                records = [_build_head(study, participant, order)]
+                records = [_build_head(study, participant, session)]
                 self._append(records[0])
             if is_new:
                 _sync_folder(path.parent)
             _check_head(path, records[0], study, participant)
-            self.order: list[dict[str, Value]] = records[0]["order"]
+            self.order = [ListedTrial.from_record(record) for record in records[0]["order"]]
             for number, record in enumerate(records[1:], start=2):
                 self._apply(record, f"{path}: line {number}")
             if self._open_trial is not None:
@@ -86,7 +90,16 @@ class TrialLog:
     @property
     def next_trial(self) -> int | None:
         """Index of the next trial that does not count yet, None after the last."""
-        return next((index for index in range(len(self.order)) if index not in self.trials), None)
+        practised = [self.trials[k] for k in sorted(self.trials) if self.order[k].phase == "practice"]
+        is_over = is_practice_over(self._study, practised)
+        left = (k for k in range(len(self.order)) if k not in self.trials)
+        return next((k for k in left if not is_over or self.order[k].phase == "main"), None)
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether nothing is left, neither a trial nor the questionnaire after the last one."""
+        parts = {question.when for question in self._study.questions}
+        return self.next_trial is None and parts <= self.answers.keys()
 
     @property
     def attempt(self) -> int:
@@ -99,7 +112,7 @@ class TrialLog:
         condition: that of the order, and the level that a procedure chose; None for that of the order
         """
         attempt = self._attempts.get(trial, 0) + 1
-        self._condition = dict(self.order[trial] if condition is None else condition)
+        self._condition = dict(self.order[trial].condition if condition is None else condition)
         self._write({"record": "begun", "trial": trial, "attempt": attempt, "condition": self._condition})
         return attempt
 
@@ -110,8 +123,9 @@ class TrialLog:
     def complete(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Record the answer of the begun trial, which then counts. Return its record."""
         trial = self._require_open()
-        head = {"record": "trial", "trial": trial, "attempt": self.attempt, "condition": self._condition}
-        head["run"] = self.run
+        listed = self.order[trial].to_record()
+        head = {"record": "trial", "trial": trial, "attempt": self.attempt, "run": self.run, **listed}
+        head["condition"] = self._condition
         record = {**head, **fields}
         self._write(record)
         return record
@@ -123,6 +137,10 @@ class TrialLog:
     def record_familiarisation(self, presentations: Sequence[Mapping[str, Any]]) -> None:
         """Record that each stimulus was shown once before the trials."""
         self._write({"record": "familiarised", "presentations": list(presentations)})
+
+    def record_answers(self, when: str, answers: Mapping[str, Any]) -> None:
+        """Record the answers to the questionnaire, `before` or `after` the trials."""
+        self._write({"record": "questionnaire", "when": when, "answers": dict(answers)})
 
     def _append(self, record: Mapping[str, Any]) -> None:
         """Append a record. It is on the disk when this returns. Raise InputError if it cannot be written."""
@@ -152,6 +170,8 @@ class TrialLog:
             self.is_familiarised = True
         elif kind == "run":
             self.run += 1
+        elif kind == "questionnaire":
+            self.answers[record["when"]] = record["answers"]
         elif kind == "begun" and self._open_trial is None and trial not in self.trials and _is_index(trial, self.order):
             self._open_trial, self._attempts[trial] = trial, record["attempt"]
         elif kind in ("trial", "spoiled", "interrupted") and self._open_trial is not None and trial == self._open_trial:
@@ -174,14 +194,22 @@ class TrialLog:
         return [_parse_line(f"{self.path}: line {k}", line) for k, line in enumerate(whole.splitlines(), start=1)]
 
 
-def read_log(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the first record of a log and the trials that count, in order. Raise InputError."""
+def read_records(path: Path) -> list[dict[str, Any]]:
+    """Return all whole records of a log. Raise InputError for another file."""
     with refuse_os_error(path, "a readable file"):
         content = path.read_bytes()
     lines = content[: content.rfind(b"\n") + 1].splitlines()
     records = [_parse_line(f"{path}: line {k}", line) for k, line in enumerate(lines, start=1)]
     if not records or records[0].get("format") != FORMAT:
         raise InputError(str(path), Unquoted("another file"), "the log of a session")
+    if records[0].get("version") != VERSION:
+        raise InputError(f"{path}: version", records[0].get("version"), f"{VERSION}: use another folder")
+    return records
+
+
+def read_log(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the first record of a log and the trials that count, in order. Raise InputError."""
+    records = read_records(path)
     trials = [record for record in records if record.get("record") == "trial"]
     return records[0], sorted(trials, key=lambda record: int(record["trial"]))
 
@@ -204,10 +232,10 @@ def _open_locked(path: Path) -> Any:
     return file
 
 
-def _build_head(study: Study, participant: str, order: Sequence[Mapping[str, Value]]) -> dict[str, Any]:
-    design = study.model_dump(mode="json")
-    head = {"record": "session", "format": FORMAT, "version": VERSION, "participant": participant}
-    return {**head, "study": design, "order": [dict(condition) for condition in order]}
+def _build_head(study: Study, participant: str, session: int) -> dict[str, Any]:
+    order = [trial.to_record() for trial in list_trials(study, participant, session)]
+    head = {"record": "session", "format": FORMAT, "version": VERSION, "participant": participant, "session": session}
+    return {**head, "study": study.model_dump(mode="json"), "order": order}
 
 
 def _can_begin_anew(records: Sequence[Mapping[str, Any]], study: Study, participant: str) -> bool:

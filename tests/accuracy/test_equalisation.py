@@ -11,13 +11,12 @@ from displays import DISPLAYS
 from felt_intensity import STEP_S, feel
 from optodrive.device.sensitivity_map import replace_sensitivity_map
 from optodrive.planning.feasibility.check import check_feasibility
-from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence
 from optodrive.study.matching import MatchingModel
 from optodrive.study.observers import Observer, Participant
 from optodrive.study.presenter import Presentation
 from optodrive.study.results import write_sensitivity
-from optodrive.study.session import SimulatedRespondent, build_matching_model, draw_order, run_session
+from optodrive.study.session import SimulatedRespondent, build_matching_model, run_session
 from optodrive.study.study_file import load_study
 from optodrive.study.trial_log import TrialLog
 
@@ -60,9 +59,10 @@ def draw_hidden(kind, seed):
 class PlannedPresenter:
     """Presents the pulses that are planned on a cold display."""
 
-    def present(self, pattern, parameters):
-        sequence = build_pattern(pattern, dict(parameters), DISPLAY.config)
-        plan = check_feasibility(DISPLAY, sequence, *DISPLAY.build_cold_state(), policy="refuse")[0].plan
+    config = DISPLAY.config
+
+    def present(self, stimulus):
+        plan = check_feasibility(DISPLAY, stimulus.sequence, *DISPLAY.build_cold_state(), policy="refuse")[0].plan
         return Presentation(0.0, plan.pixel, plan.start_s - plan.start_s[0], plan.width_s, plan.power_w, None)
 
     def wait(self, duration_s):
@@ -86,7 +86,7 @@ def match(truth, seed, folder):
     """Run the study with a participant of the given sensitivity and return the configuration with its map."""
     observer = Observer(STUDY, DISPLAY, Participant(), truth)
     presenter, model = PlannedPresenter(), build_matching_model(STUDY.matching, DISPLAY.layout)
-    with TrialLog(folder / "trials.jsonl", STUDY, "p1", draw_order(STUDY, "p1")) as log:
+    with TrialLog(folder / "trials.jsonl", STUDY, "p1") as log:
         log.begin_run("planned pulses")
         respondent = SimulatedRespondent(observer, seed, 1, presenter)
         run_session(STUDY, log, presenter, respondent, matching=model)

@@ -13,6 +13,8 @@ from optodrive.study.observers import Observer, Participant
 from optodrive.study.presenter import Presentation, VirtualPresenter
 from optodrive.study.results import Accuracy, fit_magnitudes
 from optodrive.study.study_file import Condition, Study, load_study
+from optodrive.study.trial_list import ListedTrial
+from optodrive.study.trial_stimulus import build_stimulus
 
 PREDICTED = {1: 0.979, 2: 0.930, 3: 0.793, 5: 0.889, 6: 0.979}
 """As the page states them."""
@@ -33,7 +35,8 @@ def present_conditions(study: Study, display: DisplayModel) -> list[tuple[Condit
     presenter = VirtualPresenter(display)
     shown: list[tuple[Condition, Presentation]] = []
     for condition in study.conditions:
-        shown.append((condition, presenter.present(study.stimulus.pattern, {**study.stimulus.parameters, **condition})))
+        trial = ListedTrial("main", "main", False, condition)
+        shown.append((condition, presenter.present(build_stimulus(study, trial, condition, display.config))))
         presenter.wait(study.pause_s)
     presenter.close()
     return shown
@@ -51,7 +54,7 @@ def predict_accuracy(
     observer = Observer(study, display, Participant(participant.localisation_sd_m, lapse=0.0))
     rng = np.random.default_rng(seed)
     correct = [
-        [observer.answer(presentation, rng) == study.find_correct_answer(condition) for _ in range(draws)]
+        [observer.answer(presentation, rng) == str(condition[study.response.correct_factor]) for _ in range(draws)]
         for condition, presentation in shown
     ]
     attentive, chance = float(np.mean(correct)), 1.0 / len(study.response.answers)

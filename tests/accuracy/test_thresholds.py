@@ -11,7 +11,7 @@ from optodrive.physics.sensation import compute_excitations
 from optodrive.planning.display_model import DisplayModel
 from optodrive.study.observers import Observer, Participant
 from optodrive.study.presenter import VirtualPresenter
-from optodrive.study.session import SimulatedRespondent, build_threshold_model, draw_order, list_answered, run_session
+from optodrive.study.session import SimulatedRespondent, build_threshold_model, list_answered, run_session
 from optodrive.study.study_file import load_study
 from optodrive.study.threshold import (
     GRID_MAX,
@@ -21,7 +21,9 @@ from optodrive.study.threshold import (
     draw_constant_levels,
     select_staircase_level,
 )
+from optodrive.study.trial_list import ListedTrial
 from optodrive.study.trial_log import TrialLog
+from optodrive.study.trial_stimulus import build_stimulus
 
 LEVELS = tuple(np.geomspace(20.0, 2000.0, 25))
 CHANCE = 0.5
@@ -168,7 +170,7 @@ def run_detection(display, path, number, trials_before=None):
     for on_trial in (end, lambda record: None):
         presenter = VirtualPresenter(display)
         respondent = SimulatedRespondent(observer, study.seed, number, presenter)
-        with TrialLog(path, study, "01", draw_order(study, "01")) as log:
+        with TrialLog(path, study, "01") as log:
             try:
                 run_session(study, log, presenter, respondent, on_trial)
             except EndsEarlyError:
@@ -186,7 +188,9 @@ def test_an_adaptive_session_goes_on_as_if_it_had_not_ended(display, tmp_path):
 
 def test_the_shipped_study_finds_the_threshold_of_the_channel_model(display, tmp_path):
     presenter = VirtualPresenter(display)
-    shown = presenter.present("detection", {"side": "left", "power_mw": 1000.0})
+    condition = {"side": "left", "power_mw": 1000.0}
+    trial = ListedTrial("main", "main", False, condition)
+    shown = presenter.present(build_stimulus(load_study("detection"), trial, condition, display.config))
     t_s = np.arange(0.0, shown.duration_s + 0.1, 1e-3)
     pulses = np.column_stack([shown.start_s, shown.width_s, shown.power_w, shown.pixel])
     displacement_m = display.build_cold_heat().simulate_displacement_m(pulses, int(shown.pixel[0]), t_s)

@@ -299,7 +299,7 @@ def test_the_response_time_is_that_between_the_boards_last_gate_off_and_the_answ
 def test_a_message_that_is_none_closes_the_page_and_the_session_waits(study, role):
     answer = '{"kind": "answer", "trial": -1, "attempt": 1, "presentation": 1, "answer": "x", "handled_s": 0}'
     texts = ["{}", "no JSON", "[]", '{"kind": "answer"}', '{"kind": "stop", "more": 1}', answer]
-    for text, code in (*((each, 1008) for each in texts), (" " * 2000, 1009), (b'{"kind": "\xff"}', 1007)):
+    for text, code in (*((each, 1008) for each in texts), (" " * 20_000, 1009), (b'{"kind": "\xff"}', 1007)):
         with open_wire(study.urls[role], role) as wire:
             wire.wait_for("start")
             wire.socket.send(text, text=True)

@@ -10,7 +10,7 @@ from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 SHORT = """
 format = "optodrive-study"
-version = 1
+version = 2
 name = "short"
 title = "Short"
 seed = 3
@@ -67,7 +67,7 @@ def find_defects(records):
                 defects.append(f"{kind} of trial {record['trial']}, not of {open_trial}")
             open_trial = None
         if kind == "trial":
-            if record["condition"] != order[record["trial"]]:
+            if record["condition"] != order[record["trial"]]["condition"]:
                 defects.append(f"trial {record['trial']}: another condition")
             defects += [
                 f"trial {record['trial']}: another stimulus"
@@ -81,7 +81,7 @@ def find_defects(records):
 
 def is_as_requested(record, presentation):
     """Return whether a presentation's pulses are those of the pattern, in order, widths and times from the first."""
-    requested = record["requested"]
+    (requested,) = record["requested"]
     trains = build_pattern(requested["pattern"], requested["parameters"], load_config()).trains
     rows = sorted((start_s, train.pixel, train.pulse_width_s) for train in trains for start_s in train.pulse_starts_s())
     starts_s, pixels, widths_s = zip(*rows, strict=True)

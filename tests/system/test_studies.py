@@ -45,7 +45,7 @@ def test_an_experiment_runs_to_the_end(dataset, capsys, number):
     assert Counter(str(record["condition"]) for record in trials) == {
         str(condition): study.repetitions for condition in study.conditions
     }
-    assert [record["condition"] for record in trials] == head["order"]
+    assert [record["condition"] for record in trials] == [trial["condition"] for trial in head["order"]]
     onsets = [record["presentations"][0]["onset_s"] for record in trials]
     assert onsets == sorted(onsets)
     table = (dataset / f"sub-sim01/beh/sub-sim01_task-experiment{number}_beh.tsv").read_text().splitlines()
@@ -94,7 +94,7 @@ def test_a_matching_writes_the_sensitivity_map_of_each_participant(tmp_path, cap
     assert first != second
     table = (data / "sub-sim01/beh/sub-sim01_task-equalisation_beh.tsv").read_text().splitlines()
     assert len(table) == 31
-    assert table[0].split("\t")[3:7] == ["first", "second", "first_intensity", "second_intensity"]
+    assert table[0].split("\t")[6:10] == ["first", "second", "first_intensity", "second_intensity"]
     assert validate(data)[0] == 0
     assert run_study(capsys, str(path), data, "--participants", "2") == report
 

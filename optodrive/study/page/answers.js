@@ -1,6 +1,7 @@
-// The answers of a study as buttons and keys, or a scale for a magnitude.
+// The answers of a study as buttons and keys, a scale for a magnitude, or a field for a number.
 
 const AGAIN_KEY = "0";
+const NUMBER_MAX = 1e9;
 const POSITIONS = "123456789abcdefghijklmnopqrstuvwxyz";
 
 // Return the key of each answer: its first letter or digit if these differ from each other, else its position.
@@ -10,12 +11,19 @@ export function assignKeys(answers) {
   return answers.map((_, index) => (isUsable ? firsts[index] : POSITIONS[index] ?? ""));
 }
 
+// A decimal comma is a point.
+function readNumber(text) {
+  return text.trim() === "" ? NaN : Number(text.trim().replace(",", "."));
+}
+
 export class Answers {
   // find: returns the element with an id; onAnswer: gets an answer and the event that gave it; onAgain: gets its event
   constructor(find, onAnswer, onAgain) {
     this.group = find("answers");
     this.scale = find("scale");
     this.magnitude = find("magnitude");
+    this.line = find("line");
+    this.number = find("number");
     this.value = find("value");
     this.confirm = find("confirm");
     this.again = find("again");
@@ -25,23 +33,25 @@ export class Answers {
     this.shown = "";
     this.byKey = new Map();
     this.magnitude.addEventListener("input", () => this.#chooseMagnitude());
-    this.confirm.addEventListener("click", (event) => {
-      if (this.confirm.getAttribute("aria-disabled") === "false") {
-        onAnswer(Number(this.magnitude.value), event);
-      }
-    });
+    this.number.addEventListener("input", () => this.#chooseNumber());
+    this.number.addEventListener("keydown", (event) => event.key === "Enter" && this.#confirm(event));
+    this.confirm.addEventListener("click", (event) => this.#confirm(event));
     this.again.addEventListener("click", onAgain);
     addEventListener("keydown", (event) => this.#onKey(event));
   }
 
   // Show the answers of a study; isAccepted: whether they are about a stimulus now.
-  show({ kind, answers }, isAccepted) {
-    const shown = JSON.stringify([kind, answers]);
+  show({ kind, answers, labels, again }, isAccepted) {
+    const shown = JSON.stringify([kind, answers, labels, again]);
     if (this.shown !== shown) {
       this.shown = shown;
+      this.kind = kind;
       this.group.hidden = kind !== "choice";
-      this.scale.hidden = kind !== "magnitude";
-      this.#buildButtons(answers);
+      this.scale.hidden = kind === "choice";
+      this.line.hidden = this.value.hidden = kind !== "magnitude";
+      this.number.hidden = kind !== "number";
+      this.again.hidden = !again;
+      this.#buildButtons(answers, labels, again);
     }
     this.isAccepted = isAccepted;
     for (const button of [...this.group.children, this.again]) {
@@ -49,25 +59,26 @@ export class Answers {
     }
   }
 
-  // Forget the magnitude of the trial before.
-  reset() {
+  // Forget the magnitude or number of the trial before. text: what stands for no answer
+  reset(text) {
     this.magnitude.value = 0.5;
-    this.value.textContent = "no answer yet";
+    this.number.value = "";
+    this.value.textContent = text;
     this.confirm.setAttribute("aria-disabled", "true");
   }
 
-  #buildButtons(answers) {
-    const keys = assignKeys(answers);
+  #buildButtons(answers, labels, again) {
+    const keys = assignKeys(labels);
     this.group.dataset.count = answers.length;
     this.group.replaceChildren();
     this.byKey.clear();
     answers.forEach((answer, index) => {
       const button = document.createElement("button");
       button.type = "button";
-      button.textContent = answer;
+      button.textContent = labels[index];
       if (keys[index]) {
         button.setAttribute("aria-keyshortcuts", keys[index]);
-        if (keys[index] !== answer) {
+        if (keys[index] !== labels[index]) {
           button.append(Object.assign(document.createElement("kbd"), { textContent: keys[index], ariaHidden: "true" }));
         }
         this.byKey.set(keys[index], (event) => this.onAnswer(answer, event));
@@ -75,7 +86,20 @@ export class Answers {
       button.addEventListener("click", (event) => this.onAnswer(answer, event));
       this.group.append(button);
     });
-    this.byKey.set(AGAIN_KEY, this.onAgain);
+    if (again) {
+      this.byKey.set(AGAIN_KEY, this.onAgain);
+    }
+  }
+
+  #confirm(event) {
+    if (this.confirm.getAttribute("aria-disabled") === "false") {
+      this.onAnswer(this.kind === "number" ? readNumber(this.number.value) : Number(this.magnitude.value), event);
+    }
+  }
+
+  #chooseNumber() {
+    const number = readNumber(this.number.value);
+    this.confirm.setAttribute("aria-disabled", !(number > 0 && number < NUMBER_MAX));
   }
 
   #chooseMagnitude() {
@@ -84,7 +108,7 @@ export class Answers {
   }
 
   #onKey(event) {
-    const isOther = event.repeat || event.ctrlKey || event.altKey || event.metaKey || event.target.matches("input[type=range]");
+    const isOther = event.repeat || event.ctrlKey || event.altKey || event.metaKey || event.target.matches("input:not([type=checkbox]), select");
     const act = this.byKey.get(event.key.toLowerCase());
     if (this.keys.checked && !isOther && act) {
       act(event);

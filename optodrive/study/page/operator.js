@@ -8,6 +8,7 @@ const announcer = new Announcer(find("said"));
 const STATES = {
   start: "Waits for the participant’s button",
   pause: "Paused",
+  form: "Questionnaire",
   example: "Example without a question",
   stimulus: "Stimulus",
   question: "Waits for the answer",
@@ -55,7 +56,8 @@ function onView(newest) {
   find("participant").textContent = `Participant ${view.participant}`;
   document.title = `${view.title}, ${view.participant}: operator`;
   showState(phase);
-  const which = example ? `Example ${example[0]} of ${example[1]}` : `Trial ${trial} of ${trials}`;
+  const number = view.is_practice ? `Practice trial ${trial}` : `Trial ${trial} of ${trials}`;
+  const which = example ? `Example ${example[0]} of ${example[1]}` : `${number}${view.block && !view.is_practice ? `, block ${view.block}` : ""}`;
   find("progress-text").textContent = `${which}. Answered: ${answered}${correct === null ? "" : `, of them ${correct} correct`}.`;
   find("progress-bar").max = trials;
   find("progress-bar").value = answered;
@@ -94,9 +96,9 @@ function showPage() {
 }
 
 function showNow() {
-  const { announced, condition, executed, pattern, parameters } = view;
+  const { announced, condition, executed, stimulus } = view;
   const lines = [
-    ["Requested", condition ? `${pattern}: ${describe({ ...parameters, ...condition })}` : pattern],
+    ["Requested", view.is_catch ? "catch trial" : condition ? `${stimulus}: ${describe(condition)}` : stimulus],
     ["Executed", executed ? describeExecuted(executed) : announced ? "being shown" : ""],
     ["Attempt", announced ? `${announced.attempt}, presentation ${announced.presentation}` : ""],
   ];
@@ -108,21 +110,26 @@ function describe(values) {
 }
 
 function describeExecuted({ pulses, duration_s: durationS, onset_s: onsetS }) {
+  if (onsetS === null) {
+    return `nothing, for ${durationS.toFixed(3)} s`;
+  }
   return `${pulses} pulses in ${durationS.toFixed(3)} s from ${onsetS.toFixed(6)} s of the board’s clock`;
 }
 
 function buildRow(row) {
   const mark = { true: "correct", false: "wrong", null: "" }[row.is_correct];
   const notes = [
+    row.is_practice && "practice",
+    row.is_catch && "catch trial",
     row.attempt > 1 && `attempt ${row.attempt}`,
     row.presentations > 1 && `shown ${row.presentations} times`,
     row.early_answers > 0 && `${row.early_answers} early`,
   ].filter(Boolean);
   const cells = [
     build("td", row.trial, "number"),
-    build("td", describe(row.condition)),
-    build("td", mark ? `${row.answer}, ${mark}` : row.answer, mark === "wrong" ? "wrong" : ""),
-    build("td", row.response_time_s.toFixed(3), "number"),
+    build("td", row.is_catch ? "nothing" : describe(row.condition)),
+    build("td", row.answer === null ? "none in time" : mark ? `${row.answer}, ${mark}` : row.answer, mark === "wrong" ? "wrong" : ""),
+    build("td", row.response_time_s === null ? "" : row.response_time_s.toFixed(3), "number"),
     build("td", row.response_latency_s === null ? "" : row.response_latency_s.toFixed(3), "number"),
     build("td", `${row.pulses} pulses, ${row.duration_s.toFixed(3)} s`),
     build("td", notes.join(", ")),

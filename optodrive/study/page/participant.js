@@ -2,25 +2,30 @@
 
 import { Announcer } from "./announcer.js";
 import { Answers } from "./answers.js";
+import { Form } from "./form.js";
 import { INVALID, PageSocket, REPLACED, UNAUTHORISED } from "./page_socket.js";
 
 const find = (id) => document.getElementById(id);
 const announcer = new Announcer(find("said"));
 const LOST = {
-  [REPLACED]: ["Not in use", "This page was opened in another window, which is in use now. Reload to use this one."],
+  [REPLACED]: ["replaced", "replaced_hint"],
   [UNAUTHORISED]: ["Not valid", "The address of this page is not valid, or no longer. Please tell the operator."],
   [INVALID]: ["Error", "Please tell the operator, and reload this page."],
 };
+const ENGLISH = { lost: "No connection", lost_hint: "Trying again. If this lasts, please tell the operator." };
+const DURING = ["stimulus", "question", "rest", "pause"];
 
 let view = null;
 let said = "";
 let place = "";
+let texts = ENGLISH;
 
 const answers = new Answers(
   find,
   (answer, event) => sendAbout({ kind: "answer", answer, handled_s: measureDelay(event) }),
   () => sendAbout({ kind: "again" }),
 );
+const form = new Form(find, (filled) => socket.send({ kind: "form", answers: filled }));
 const socket = new PageSocket("participant/socket", onView, onLost);
 find("begin").addEventListener("click", () => socket.send({ kind: "ready" }));
 find("break").addEventListener("click", () => socket.send({ kind: "break" }));
@@ -37,49 +42,104 @@ function sendAbout(message) {
   }
 }
 
-function describe({ phase, is_begun: isBegun, is_early: isEarly, example, answered }) {
+// Return a sentence of the page; words in braces stand for values.
+function sayText(key, values = {}) {
+  return (texts[key] ?? key).replace(/\{(\w+)\}/g, (_, name) => values[name]);
+}
+
+function findLabel(answer) {
+  return view.labels[view.answers.indexOf(answer)] ?? answer;
+}
+
+function describe({ phase, is_begun: isBegun, is_early: isEarly, example }) {
   switch (phase) {
     case "start":
-      return isBegun
-        ? ["Break", "Place your finger on the display. Press Continue when you are ready."]
-        : ["Ready?", "Place your finger on the display. Press Start when you are ready."];
+      return isBegun ? [sayText("break"), sayText("break_hint")] : [sayText("ready"), sayText("ready_hint")];
     case "pause":
-      return ["Pause", "The study goes on when the operator continues."];
+      return [sayText("pause"), sayText("pause_hint")];
+    case "form":
+      return [sayText("questions"), sayText("questions_hint")];
     case "example":
-      return ["Feel", `Example ${example[0]} of ${example[1]}. No answer is needed.`];
+      return [sayText("feel"), sayText("example_hint", { number: example[0], count: example[1] })];
     case "stimulus":
-      return ["Feel", "Answer when the stimulus has ended."];
+      return [sayText("feel"), sayText("stimulus_hint")];
     case "question":
-      return ["Answer now", isEarly ? "You answered before the stimulus had ended. Please answer now." : ""];
+      return [sayText("answer_now"), isEarly ? sayText("early_hint") : ""];
     case "rest":
-      return ["Wait", answered === null ? "The next stimulus comes." : `Your answer: ${answered}. The next stimulus comes.`];
+      return [sayText("wait"), describeRest(view)];
     case "done":
-      return ["Finished", "Thank you. You may take your finger away."];
+      return [sayText("done"), sayText("done_hint")];
     default:
-      return ["Stopped", "Please wait for the operator."];
+      return [sayText("stopped"), sayText("stopped_hint")];
   }
+}
+
+// What became of the last answer, and what comes next.
+function describeRest({ answered, has_missed: hasMissed, is_correct: isCorrect, correct, is_last: isLast }) {
+  return [
+    answered !== null && sayText("answered", { answer: findLabel(answered) }),
+    hasMissed && sayText("no_answer"),
+    isCorrect === true && sayText("correct"),
+    isCorrect === false && sayText("wrong", { answer: findLabel(correct) }),
+    !isLast && sayText("next"),
+  ]
+    .filter(Boolean)
+    .join(" ");
+}
+
+function describeProgress({ phase, trial, trials, example, is_practice: isPractice, is_begun: isBegun }) {
+  if (phase === "done") {
+    return sayText("all_trials", { count: trials });
+  }
+  if (phase === "example") {
+    return sayText("example", { number: example[0], count: example[1] });
+  }
+  if (phase === "form" || (phase === "start" && !isBegun)) {
+    return sayText("trials", { count: trials });
+  }
+  return isPractice ? sayText("practice", { number: trial }) : sayText("trial", { number: trial, count: trials });
 }
 
 function onView({ view: number, ...newest }) {
   socket.send({ kind: "seen", view: number });
   view = newest;
+  texts = view.texts;
   const { phase, trial, trials, announced } = view;
   const [state, hint] = describe(view);
+  showTexts();
   show(phase, state, hint);
-  find("progress-text").textContent = phase === "done" ? `All ${trials} trials` : `Trial ${trial} of ${trials}`;
+  find("progress-text").textContent = describeProgress(view);
   find("progress-bar").max = trials;
-  find("progress-bar").value = phase === "done" ? trials : trial - 1;
+  find("progress-bar").value = phase === "done" || view.is_last ? trials : view.is_practice ? 0 : trial - 1;
   document.title = `${view.title}: ${state}`;
   find("question").textContent = view.question;
+  showInstructions(phase);
+  form.show(view.questions);
   answers.show(view, announced !== null);
   const newPlace = JSON.stringify(announced);
   if (announced !== null && newPlace !== place) {
     place = newPlace;
-    answers.reset();
+    answers.reset(sayText("no_answer_yet"));
   }
-  find("begin").textContent = view.is_begun ? "Continue" : "Start";
   say(phase, state, hint);
   keepFocus(phase);
+}
+
+function showTexts() {
+  document.documentElement.lang = view.language;
+  const elements = { break: "take_break", "keys-text": "keys", "again-text": "again", confirm: "confirm", send: "send", "magnitude-label": "scale", "number-label": "number" };
+  for (const [id, key] of Object.entries(elements)) {
+    find(id).textContent = sayText(key);
+  }
+  find("begin").textContent = sayText(view.is_begun ? "continue" : "start");
+}
+
+function showInstructions(phase) {
+  const paragraphs = (view.instructions ?? "").split(/\n\s*\n/).filter(Boolean);
+  find("instructions").hidden = !["start", "form"].includes(phase) || paragraphs.length === 0;
+  find("instructions").replaceChildren(
+    ...paragraphs.map((text) => Object.assign(document.createElement("p"), { textContent: text.trim() })),
+  );
 }
 
 function show(phase, state, hint) {
@@ -87,19 +147,23 @@ function show(phase, state, hint) {
   find("state").textContent = state;
   find("hint").textContent = hint;
   find("begin").hidden = phase !== "start";
-  find("by-keys").hidden = ["done", "stopped", "lost"].includes(phase);
-  find("task").hidden = !["stimulus", "question", "rest", "pause"].includes(phase);
-  find("break").hidden = !["stimulus", "question", "rest", "pause", "example"].includes(phase);
+  find("by-keys").hidden = ["done", "stopped", "lost", "form"].includes(phase);
+  find("task").hidden = !DURING.includes(phase) || view?.is_last;
+  find("break").hidden = ![...DURING, "example"].includes(phase) || view?.is_last;
+  if (phase !== "form") {
+    find("form").hidden = true;
+  }
 }
 
 // Each state is said once, with its trial and, where there is one, the question.
 function say(phase, state, hint) {
-  const { trial, trials } = view;
-  const parts = { stimulus: `Trial ${trial} of ${trials}. ${state}.`, question: `${state}. ${view.is_early ? `${hint} ` : ""}${view.question}` };
+  const { trial, is_practice: isPractice } = view;
+  const parts = { stimulus: `${describeProgress(view)}. ${state}.`, question: `${state}. ${view.is_early ? `${hint} ` : ""}${view.question}` };
   const text = parts[phase] ?? `${/[.?!]$/.test(state) ? state : `${state}.`} ${hint}`;
-  if (`${trial} ${text}` !== said) {
-    said = `${trial} ${text}`;
-    announcer.say(text);
+  if (`${isPractice} ${trial} ${text}` !== said) {
+    said = `${isPractice} ${trial} ${text}`;
+    const instructions = phase === "start" ? (view.instructions ?? "") : "";
+    announcer.say(`${text} ${instructions}`.trim());
   }
 }
 
@@ -115,17 +179,17 @@ function keepFocus(phase) {
 
 function onLost(code, isTriedAgain) {
   if (isTriedAgain) {
-    showLost("No connection", "Trying again. If this lasts, please tell the operator.");
+    showLost(sayText("lost"), sayText("lost_hint"));
   } else if (LOST[code]) {
-    showLost(...LOST[code]);
+    showLost(...LOST[code].map((key) => sayText(key)));
   }
 }
 
 function showLost(state, hint) {
-  view = null;
   show("lost", state, hint);
   if (said !== state) {
     said = state;
     announcer.say(`${state}. ${hint}`);
   }
+  view = null;
 }

@@ -11,16 +11,13 @@ from optodrive.cli.main import run
 from optodrive.cli.study import STUDY_HELP
 from optodrive.core.errors import InputError
 from optodrive.study.dataset import build_log_path, check_new_participant, write_dataset
-from optodrive.study.session import draw_order
 from optodrive.study.study_file import list_shipped_studies, load_study
 from optodrive.study.trial_log import TrialLog
 
 
 def begin_session(folder, participant):
     study = load_study("detection")
-    with TrialLog(
-        build_log_path(folder, study, participant), study, participant, draw_order(study, participant)
-    ) as log:
+    with TrialLog(build_log_path(folder, study, participant), study, participant) as log:
         log.begin_run("a test")
         log.begin(0)
     write_dataset(folder)
@@ -114,7 +111,7 @@ def test_a_table_that_cannot_be_extended_is_kept_and_named(tmp_path, capsys, con
 def test_a_participant_without_a_stimulus_is_not_listed(tmp_path):
     study = load_study("detection")
     begin_session(tmp_path, "01")
-    with TrialLog(build_log_path(tmp_path, study, "02"), study, "02", draw_order(study, "02")) as log:
+    with TrialLog(build_log_path(tmp_path, study, "02"), study, "02") as log:
         log.begin_run("a test")
     write_dataset(tmp_path)
     assert (tmp_path / "participants.tsv").read_text() == "participant_id\tkind\nsub-01\tperson\n"

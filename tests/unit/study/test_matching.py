@@ -10,7 +10,7 @@ from optodrive.study.matching import MatchingModel, spread_places
 from optodrive.study.observers import Observer, Participant, draw_sensitivity
 from optodrive.study.presenter import VirtualPresenter
 from optodrive.study.results import compute_variation, write_sensitivity
-from optodrive.study.session import SimulatedRespondent, build_matching_model, draw_order, run_session
+from optodrive.study.session import SimulatedRespondent, build_matching_model, run_session
 from optodrive.study.study_file import EXPERIMENTS, load_study
 from optodrive.study.trial_log import TrialLog
 
@@ -98,11 +98,11 @@ class EndingPresenter(VirtualPresenter):
 
     presentations_left = 10**6
 
-    def present(self, pattern, parameters):
+    def present(self, stimulus):
         self.presentations_left -= 1
         if self.presentations_left < 0:
             raise KeyboardInterrupt
-        return super().present(pattern, parameters)
+        return super().present(stimulus)
 
 
 def write_study(folder, trials=TRIALS):
@@ -116,7 +116,7 @@ def run(study, path, presentations=10**6):
     truth, presenter = draw_sensitivity(LAYOUT, 2.0, np.random.default_rng(8)), EndingPresenter(DISPLAY)
     presenter.presentations_left = presentations
     respondent = SimulatedRespondent(Observer(study, DISPLAY, Participant(), truth), 1, 1, presenter)
-    with TrialLog(path, study, "p1", draw_order(study, "p1")) as log:
+    with TrialLog(path, study, "p1") as log:
         log.begin_run("test")
         try:
             run_session(study, log, presenter, respondent, matching=build_matching_model(study.matching, LAYOUT))
@@ -163,7 +163,7 @@ def test_the_map_of_a_session_is_one_that_a_configuration_may_name(tmp_path):
         (
             "[matching]",
             '[procedure]\nkind = "staircase"\nparameter = "x"\nlevels = [1.0, 2.0, 3.0]\ntrials = 3\n\n[matching]',
-            "procedure: got 'staircase'",
+            "procedure: got a section",
         ),
         ("pause_s = 0.3", "pause_s = 0.3\nrepetitions = 2", "repetitions: got 2"),
         ("trials = 1000", "trials = 0", "matching.trials: got 0"),

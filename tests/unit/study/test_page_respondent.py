@@ -11,12 +11,14 @@ from optodrive.study.page_respondent import INPUTS_MAX, PageRespondent
 from optodrive.study.presenter import Presentation
 from optodrive.study.session import RepeatReason, Response
 from optodrive.study.study_file import load_study
+from optodrive.study.trial_list import ListedTrial
 
 CHOICE, MAGNITUDE = load_study("experiment-1"), load_study("experiment-4")
 ONSET_S, DURATION_S = 100.0, 2.0
 END_S = ONSET_S + DURATION_S
 READY, BREAK = ReadyMessage(kind="ready"), ReadyMessage(kind="break")
 CONDITION = {"direction": "left"}
+LISTED = ListedTrial("main", "main", False, CONDITION)
 
 
 def present():
@@ -47,7 +49,7 @@ def respondent():
     respondent = PageRespondent(CHOICE, "07", {})
     respondent.page = respondent.join()
     respondent.receive(respondent.page, READY, 90.0, None)
-    respondent.announce(0, 1, 1, CONDITION)
+    respondent.announce(0, 1, 1, LISTED, CONDITION)
     return respondent
 
 
@@ -74,11 +76,11 @@ def test_early_answers_are_summed_over_the_presentations_of_an_attempt(responden
     respondent.receive(respondent.page, say("up"), ONSET_S, None)
     respondent.receive(respondent.page, AGAIN, END_S + 1.0, None)
     assert respondent.respond(present(), 0, 1) is RepeatReason.REQUESTED
-    respondent.announce(0, 1, 2, CONDITION)
+    respondent.announce(0, 1, 2, LISTED, CONDITION)
     respondent.receive(respondent.page, say("up", presentation=2), ONSET_S, None)
     respondent.receive(respondent.page, say("left", presentation=2), END_S + 1.0, None)
     assert respondent.respond(present(), 0, 1).early_answers == 2
-    respondent.announce(1, 1, 1, CONDITION)
+    respondent.announce(1, 1, 1, LISTED, CONDITION)
     respondent.receive(respondent.page, say("left", trial=1), END_S, None)
     assert respondent.respond(present(), 1, 1).early_answers == 0
 
@@ -105,7 +107,7 @@ def test_a_magnitude_lies_between_zero_and_one(wrong):
     respondent = PageRespondent(MAGNITUDE, "07", {})
     page = respondent.join()
     respondent.receive(page, READY, 90.0, None)
-    respondent.announce(0, 1, 1, {"level": 3})
+    respondent.announce(0, 1, 1, LISTED, {"level": 3})
     respondent.receive(page, say(wrong), END_S, None)
     respondent.receive(page, say(0.25), END_S + 1.0, None)
     assert respondent.respond(present(), 0, 1).answer == 0.25
@@ -126,7 +128,7 @@ def test_an_answer_counts_once(respondent):
     respondent.receive(respondent.page, say("left"), END_S, None)
     respondent.respond(present(), 0, 1)
     respondent.receive(respondent.page, say("right"), END_S + 0.1, None)
-    respondent.announce(1, 1, 1, CONDITION)
+    respondent.announce(1, 1, 1, LISTED, CONDITION)
     respondent.receive(respondent.page, say("right"), END_S + 0.2, None)
     respondent.receive(respondent.page, say("up", trial=1), END_S + 0.3, None)
     assert respondent.respond(present(), 1, 1).answer == "up"
@@ -168,7 +170,7 @@ def test_an_answer_that_arrived_before_its_page_was_lost_counts(respondent):
 
 def test_a_page_that_is_lost_between_readiness_and_stimulus_interrupts_it(respondent):
     respondent.leave(respondent.page)
-    respondent.announce(0, 1, 2, CONDITION)
+    respondent.announce(0, 1, 2, LISTED, CONDITION)
     assert respondent.respond(present(), 0, 1) is RepeatReason.INTERRUPTED
 
 
@@ -221,14 +223,14 @@ def test_a_stimulus_that_was_not_as_requested_has_no_question_and_the_operator_r
     respondent.withdraw("3 of 4 pulses executed")
     assert respondent.build_participant_view(respondent.page).phase == "rest"
     assert respondent.build_operator_view().notice == "trial 1 is repeated: 3 of 4 pulses executed"
-    respondent.announce(0, 2, 1, CONDITION)
+    respondent.announce(0, 2, 1, LISTED, CONDITION)
     respondent.receive(respondent.page, say("up", attempt=2), END_S + 1.0, None)
     assert respondent.respond(present(), 0, 2).answer == "up"
 
 
 def test_the_participant_is_never_shown_a_condition(respondent):
     condition = {"direction": "a direction that no answer names"}
-    respondent.announce(0, 1, 1, condition)
+    respondent.announce(0, 1, 1, LISTED, condition)
     view = respondent.build_participant_view(respondent.page).model_dump_json()
     assert "condition" not in view
     assert condition["direction"] not in view
@@ -249,7 +251,7 @@ def test_every_phase_has_its_views():
     respondent.receive(page, READY, 1.0, None)
     respondent.announce_example(1, 4)
     note()
-    respondent.announce(0, 1, 1, CONDITION)
+    respondent.announce(0, 1, 1, LISTED, CONDITION)
     note()
     results, thread = start(respondent.respond, present(), 0, 1)
     while respondent.build_operator_view().phase != "question":

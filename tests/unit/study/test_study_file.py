@@ -7,8 +7,8 @@ import pytest
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.pattern_registry import build_pattern
-from optodrive.study.session import draw_order
 from optodrive.study.study_file import EXPERIMENTS, list_shipped_studies, load_study
+from optodrive.study.trial_list import list_trials
 
 TRIALS = {1: 20, 2: 36, 3: 45, 4: 72, 5: 24, 6: 30}
 """Trials per participant (Text S5)."""
@@ -49,17 +49,17 @@ def test_every_condition_is_a_stimulus_of_the_display(number):
 
 def test_the_order_has_every_condition_as_often_and_differs_between_participants():
     study = load_study("experiment-5")
-    order = draw_order(study, "01")
-    assert Counter(map(str, order)) == {str(condition): 4 for condition in study.conditions}
-    assert order == draw_order(study, "01")
-    assert order != draw_order(study, "02")
-    assert order != draw_order(study.model_copy(update={"seed": 9}), "01")
+    order = list_trials(study, "01")
+    assert Counter(str(trial.condition) for trial in order) == {str(condition): 4 for condition in study.conditions}
+    assert order == list_trials(study, "01")
+    assert order != list_trials(study, "02")
+    assert order != list_trials(study.model_copy(update={"seed": 9}), "01")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("version = 1", "version = 2", "version: got 2, expected 1"),
+        ("version = 2", "version = 1", "version: got 1, expected 2, the one this release reads"),
         ("chance_level = 0.25", "chance_level = 0.5", "response.chance_level: got 0.5, expected 0.2500"),
         ('correct_factor = "direction"', 'correct_factor = "speed"', "correct_factor: got 'speed', expected one of"),
         ("repetitions = 5", "repetitions = 0", "repetitions: got 0"),

@@ -8,17 +8,17 @@ import pytest
 
 from limited_files import largest_file
 from optodrive.core.errors import BusyError, InputError
-from optodrive.study.session import draw_order
 from optodrive.study.study_file import load_study
+from optodrive.study.trial_list import list_trials
 from optodrive.study.trial_log import TrialLog
 
 STUDY = load_study("experiment-1")
-ORDER = draw_order(STUDY, "01")
+ORDER = list_trials(STUDY, "01")
 ANSWER = {"answer": "left", "is_correct": True}
 
 
-def open_log(path, study=STUDY, participant="01", order=ORDER):
-    return TrialLog(path, study, participant, order)
+def open_log(path, study=STUDY, participant="01"):
+    return TrialLog(path, study, participant)
 
 
 def run_trials(log, count):
@@ -35,9 +35,9 @@ def test_a_session_goes_on_where_it_ended(tmp_path):
     path = tmp_path / "log.jsonl"
     with open_log(path) as log:
         run_trials(log, 3)
-    with open_log(path, order=list(reversed(ORDER))) as log:
+    with open_log(path) as log:
         assert log.next_trial == 3
-        assert log.order == ORDER  # the recorded one
+        assert log.order == ORDER
         run_trials(log, len(ORDER) - 3)
         assert log.next_trial is None
     assert kinds(path) == ["session"] + ["begun", "trial"] * len(ORDER)
@@ -142,15 +142,15 @@ def test_every_line_is_on_the_disk_before_the_session_goes_on(tmp_path, monkeypa
 
 @pytest.mark.parametrize(("participant", "can_begin_anew"), [("01", False), ("sim01", True)])
 def test_a_changed_study_begins_anew_before_the_first_stimulus(tmp_path, participant, can_begin_anew):
-    path, changed = tmp_path / "log.jsonl", STUDY.model_copy(update={"title": "Corrected", "pause_s": 2.0})
+    path, changed = tmp_path / "log.jsonl", STUDY.model_copy(update={"title": "Corrected", "seed": 2})
     open_log(path, participant=participant).__exit__(None, None, None)
-    with open_log(path, changed, participant, ORDER[:5]) as log:
-        assert log.order == ORDER[:5]
+    with open_log(path, changed, participant) as log:
+        assert log.order == list_trials(changed, participant)
         log.begin(0)
     assert kinds(path) == ["session", "begun"]
     if can_begin_anew:  # nobody felt the stimulus of a simulated participant
         with open_log(path, STUDY, participant) as log:
-            assert log.order == ORDER
+            assert log.order == list_trials(STUDY, participant)
             run_trials(log, 1)
     content = path.read_bytes()
     with pytest.raises(InputError, match="a changed one needs another folder"):
