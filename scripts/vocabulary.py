@@ -1,4 +1,4 @@
-"""Check names and prose against docs/glossary.md.
+"""Check names and prose against scripts/retired_names.toml: docs/glossary.md has the names in their place.
 
 Three rules: no retired word in an identifier or a public key, no retired phrase in any text, and one plain sentence as
 the first line of every docstring.
@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
-GLOSSARY = ROOT / "docs" / "glossary.md"
+RETIRED_NAMES = ROOT / "scripts" / "retired_names.toml"
 CODE = ("optodrive", "firmware_protocol", "configs", "scripts", "tests")
 DOCUMENTS = ("docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md")
-ENTRY = re.compile(r"`([^`]+)`")
 WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 TEXT = (".py", ".c", ".h", ".js", ".css", ".html", ".md", ".toml", ".pml", ".service")
 VAGUE = re.compile(r";|\b(what|whoever|whatever)\b", re.IGNORECASE)
@@ -60,9 +59,8 @@ class Retired(NamedTuple):
 
 
 def load_phrases(text: str) -> re.Pattern[str]:
-    """Return a pattern for the phrases in the table of two columns."""
-    rows = [line for line in text.splitlines() if line.startswith("|") and line.count("|") == 3]
-    phrases = [entry for line in rows for entry in ENTRY.findall(line.split("|")[1])]
+    """Return a pattern for the phrases of the table [phrases]."""
+    phrases = [phrase for listed in tomllib.loads(text)["phrases"].values() for phrase in listed]
     # A single word also matches its inflections; the last word of a phrase must end.
     alternatives = "|".join(
         r"\s+".join(map(re.escape, phrase.split())) + (r"\b" if " " in phrase else "") for phrase in phrases
@@ -75,7 +73,7 @@ def find_phrases(path: str, source: str, phrases: re.Pattern[str]) -> Iterator[s
     for number, line in enumerate(source.splitlines(), 1):
         match = phrases.search(line)
         if match:
-            yield f"{path}:{number}: {match[0]!r} (docs/glossary.md retires the phrase)"
+            yield f"{path}:{number}: {match[0]!r} (scripts/retired_names.toml retires the phrase)"
 
 
 def find_vague_docstrings(path: str, source: str) -> Iterator[str]:
@@ -93,13 +91,8 @@ def split_words(name: str) -> tuple[str, ...]:
 
 
 def load_retired(text: str) -> Retired:
-    """Read the last column of every table row of the glossary."""
-    entries = [
-        entry
-        for line in text.splitlines()
-        if line.startswith("|") and line.count("|") == 4
-        for entry in ENTRY.findall(line.split("|")[3])
-    ]
+    """Read the names of the table [names]."""
+    entries = [entry for listed in tomllib.loads(text)["names"].values() for entry in listed]
     return Retired(
         frozenset(entry[1:] for entry in entries if entry.startswith("=")),
         frozenset(entry[:-2] for entry in entries if entry.endswith("()")),
@@ -179,8 +172,8 @@ def tracked_files() -> list[str]:
 
 def main() -> int:
     """Print every problem with its place. The exit status is 1 if there is one."""
-    glossary = GLOSSARY.read_text(encoding="utf-8")
-    retired, phrases = load_retired(glossary), load_phrases(glossary)
+    listed = RETIRED_NAMES.read_text(encoding="utf-8")
+    retired, phrases = load_retired(listed), load_phrases(listed)
     verdicts: dict[tuple[str, bool], str | None] = {}
     problems = set()
     for path in tracked_files():
@@ -188,7 +181,7 @@ def main() -> int:
         if suffix not in TEXT:
             continue
         source = (ROOT / path).read_text(encoding="utf-8")
-        if ROOT / path not in (GLOSSARY, Path(__file__).resolve()):  # both spell the phrases out
+        if ROOT / path not in (RETIRED_NAMES, Path(__file__).resolve()):  # both spell the phrases out
             problems.update(find_phrases(path, source, phrases))
         if suffix == ".py" and path.startswith("optodrive/"):
             problems.update(find_vague_docstrings(path, source))
@@ -198,7 +191,7 @@ def main() -> int:
                 verdicts[key] = retired.find(name)
             entry = verdicts[key]
             if entry is not None:
-                problems.add(f"{name.path}:{name.line}: {name.text} (docs/glossary.md retires {entry})")
+                problems.add(f"{name.path}:{name.line}: {name.text} (scripts/retired_names.toml retires {entry})")
     for problem in sorted(problems):
         print(problem)
     return 1 if problems else 0

@@ -19,7 +19,7 @@ from vocabulary import (
 )
 
 FOR_EVER = " ".join(("for", "ever"))
-RETIRED = load_retired("| term | meaning | `standing_on`, `=Basis`, `tick()` |\n| other | text `kept` | |\n")
+RETIRED = load_retired('[names]\nterm = ["standing_on", "=Basis", "tick()"]\n[phrases]\nkept = ["kept"]\n')
 
 
 def find(names):
@@ -83,7 +83,7 @@ def test_toml_keys_at_every_depth():
     assert not find(toml_names("x.toml", 'a = "standing_on"'))
 
 
-PHRASES = load_phrases(f"| `{FOR_EVER}`, `deem` | compute |\n| term | meaning | `kept` |\n")
+PHRASES = load_phrases(f'[names]\nterm = ["kept"]\n[phrases]\ncompute = ["{FOR_EVER}", "deem"]\n')
 
 
 @pytest.mark.parametrize(("text", "count"), [(f"it goes on {FOR_EVER}", 1), ("Deemed anew", 1), ("forever kept", 0)])
