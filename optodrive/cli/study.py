@@ -354,6 +354,8 @@ def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], ou
 
 
 def _format_report(report: dict[str, Any]) -> Iterator[str]:
+    from optodrive.study.threshold import ThresholdEstimate
+
     yield f"study            {report['study']}"
     yield f"participants     {len(report['participants'])}, {report['trials']} trials in all"
     if report["repeated"]:
@@ -372,9 +374,9 @@ def _format_report(report: dict[str, Any]) -> Iterator[str]:
             equality = f"{report['threshold_of']} {found['equality']:.3g}"
             yield f"equality         {name}: {equality} ({found['reversals']} reversals)"
             continue
-        interval = f"95 % interval {found['low']:.3g} to {found['high']:.3g}"
-        yield f"threshold        {name}: {report['threshold_of']} {found['threshold']:.3g} ({interval})"
-        yield from (f"doubtful         {name}: {doubt}" for doubt in found["doubts"])
+        estimate = ThresholdEstimate(**found)
+        yield f"threshold        {name}: {report['threshold_of']} {estimate}"
+        yield from (f"doubtful         {name}: {flag}: {flag.explanation}" for flag in estimate.flags)
     for name, found in report.get("sensitivity", {}).items():
         yield (
             f"sensitivity      {name}: {found['low']:.2f} to {found['high']:.2f}, "
