@@ -34,8 +34,14 @@ its name ends in a unit, a boolean if its meaning begins with "whether", else a 
 `FrameResult` and `HoldReport` that do not apply are absent; all other models always have all members.
 """
 
-SAYS_NOTHING = re.compile(r"(of|its|their)( (the|its|each|a))?( \w+)?")
-"""A meaning that repeats the name of member and model, such as "of the pulse"."""
+FILLERS = """a all an and any as at by each first for from has have if in index into is it of on or that the their them
+this time to until was were which with without null none one number string text list last s um ms id these those its are
+"""
+SAYS_LITTLE = frozenset(FILLERS.split())
+"""Words that add nothing to the names of member and model and to the model's summary.
+
+A member with no other word in its meaning stands without it, behind those that have one.
+"""
 UNITS = {
     "s": "s",
     "ms": "ms",
@@ -149,10 +155,20 @@ def format_model(name, schema, configured):
         lines += ["Members as [configured](configuration.md)" + (", and:" if members else "."), ""]
     stated = [member for group in meanings for member in group]
     rest = [(member,) for member in members if member not in stated]
-    rows = []
+    known = split_words(f"{name} {summary}")
+    rows, bare = [], []
     for group in sorted([*meanings, *rest], key=lambda group: list(members).index(group[0])):
-        rows.append(format_members({member: members[member] for member in group}, meanings.get(group, "")))
-    return "\n".join([*lines, *rows, ""] if rows else lines)
+        meaning = meanings.get(group, "")
+        is_said = split_words(meaning) <= known | split_words(" ".join(group)) | SAYS_LITTLE
+        row = format_members({member: members[member] for member in group}, "" if is_said else meaning)
+        (bare if is_said else rows).append(row)
+    rows += [f"- {'; '.join(bare)}"] if bare else []
+    return "\n".join([*lines, *(row if row.startswith("- ") else f"- {row}" for row in rows), ""] if rows else lines)
+
+
+def split_words(text):
+    """Return the words of a text and of the names in it, in lower case and without a plural's s."""
+    return {word.lower().rstrip("s") for word in re.findall(r"[A-Z]?[a-z]+|\d+|[A-Z]+", text)}
 
 
 def format_members(kinds, meaning):
@@ -172,7 +188,7 @@ def format_members(kinds, meaning):
         stated = bare
         meaning = re.sub(rf", {unit}(?=,|;|$)", "", meaning) if unit else meaning
     meaning = re.sub(r", null (without (one|any|it)|otherwise)$", "", meaning)
-    return f"- {', '.join(labels)}" + (f": {meaning}" if meaning and not SAYS_NOTHING.fullmatch(meaning) else "")
+    return f"{', '.join(labels)}" + (f": {meaning}" if meaning else "")
 
 
 def read_meanings(description, members):
