@@ -11,6 +11,7 @@ from named_code import find_missing
 ROOT = Path(__file__).resolve().parent.parent
 PROTOCOL_FOLDER = "firmware_protocol"
 PROTOCOL_PAGES = ("PROTOCOL.md", "SENSOR.md")
+PAGES_OUTSIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 DECISION_WORDS_MAX = 150
 """Words of a decision, its title and date apart."""
 CHANGELOG_LINES_MAX = 60
@@ -18,7 +19,10 @@ CHANGELOG_LINES_MAX = 60
 
 
 def on_config(config):
-    """Add every decision to the navigation. Bound the changelog."""
+    """Add every decision to the navigation. Bound the changelog, and look up the code that pages outside docs/ name."""
+    for name in PAGES_OUTSIDE:
+        if missing := find_missing((ROOT / name).read_text(encoding="utf-8")):
+            raise PluginError(f"{name} names code that does not exist: {', '.join(missing)}")
     lines = len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines())
     # A merge by union brings back what one side has removed.
     if lines > CHANGELOG_LINES_MAX:
