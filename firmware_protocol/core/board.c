@@ -113,6 +113,22 @@ static enum fault watch_inputs(struct board *b) {
     return find_input_fault(became_unsafe);
 }
 
+/* B16: a head that ceases to be ready is a fault; one that is not ready at power-up only prevents arming. Returns the fault. */
+static enum fault watch_head(struct board *b, uint64_t now_us) {
+    if (b->config.interface != INTERFACE_XY2_100) {
+        return FAULT_NONE;
+    }
+    bool was_ready = is_head_ready(b);
+    uint16_t status;
+    if (b->hal.read_head(b->hal.context, &status)) {
+        b->head = status;
+        b->head_us = now_us;
+    } else if (now_us - b->head_us > BOARD_HEAD_US) {
+        b->head = 0;
+    }
+    return was_ready && !is_head_ready(b) ? FAULT_HEAD : FAULT_NONE;
+}
+
 /* Starts the job that awaits an edge, if one came since its START_ON_TRIGGER. Several edges between two ticks count, but only
    the last one has a time. */
 static void watch_trigger(struct board *b, uint64_t now_us) {
@@ -153,15 +169,15 @@ static void watch_readback(struct board *b, uint64_t now_us) {
     }
 }
 
-/* The inputs are read before points are carried out, so that no pulse begins in the tick that sees an unsafe one. */
+/* Inputs and head are read before points are carried out, so that no pulse begins in the tick that sees an unsafe one. */
 void board_tick(struct board *b, uint64_t now_us) {
     watch_tick(b, now_us);
     watch_readback(b, now_us);
-    enum fault input_fault = watch_inputs(b);
+    enum fault input_fault = watch_inputs(b), head_fault = watch_head(b, now_us);
     watch_trigger(b, now_us);
     advance(b, now_us);
-    if (input_fault != FAULT_NONE) {
-        enter_fault(b, input_fault);
+    if (input_fault != FAULT_NONE || head_fault != FAULT_NONE) {
+        enter_fault(b, input_fault != FAULT_NONE ? input_fault : head_fault);
     }
     guards_tick(&b->guards, &b->limits, &b->config, b->now_us);
 #if MUTANT != 15

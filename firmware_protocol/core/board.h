@@ -30,6 +30,7 @@
 #ifndef BOARD_TICK_LATE_US
 #define BOARD_TICK_LATE_US 500u  /* a tick later than this is fault TICK */
 #endif
+#define BOARD_HEAD_US 50u         /* a head without a valid status for longer is not ready */
 #define BOARD_READBACK_US 100u   /* a gate that differs from its command for longer is fault READBACK */
 
 /* An event for a log. */
@@ -53,6 +54,8 @@ struct board_hal {
     bool (*read_gate)(void *context);
     void (*move_mirrors)(void *context, uint16_t x, uint16_t y);
     uint8_t (*read_inputs)(void *context); /* INPUT_ bits */
+    /* Whether a valid status of the scan head came since the last call, and its word; never called on an analog board. */
+    bool (*read_head)(void *context, uint16_t *status);
     uint32_t (*read_triggers)(void *context, uint64_t *last_us); /* edges so far, and the time of the last one if any */
     void (*set_indicator)(void *context, bool on);
     void (*set_relay)(void *context, bool closed);
@@ -189,6 +192,9 @@ struct board {
     uint64_t underruns_us[UNDERRUNS_MAX];
     uint32_t underruns_count, underruns_total;
     uint64_t laser_on_duty_us; /* µs × duty */
+
+    uint64_t head_us; /* of the tick that read its last status */
+    uint16_t head;    /* the status, 0: none */
 
     uint64_t last_tick_us, readback_at_us;
     uint64_t readback_differs_us[2]; /* by commanded level: how long it has differed since it last agreed */

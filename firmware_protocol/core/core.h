@@ -101,6 +101,10 @@ bool is_leased(uint8_t state);
 /* B9: returns the fault of the first of some unsafe inputs, FAULT_NONE if there are none. */
 enum fault find_input_fault(uint8_t unsafe);
 uint8_t find_unsafe_inputs(uint8_t inputs);
+/* B16: returns whether the mirrors' scan head is ready; one that returns no status by its interface counts as ready. */
+bool is_head_ready(const struct board *b);
+/* B9, B16: returns the fault for which no pulse may begin now, FAULT_NONE if there is none. */
+enum fault find_unsafe(const struct board *b);
 /* Encodes a message of the session; returns the number of bytes, 0 without a session. */
 size_t encode_message(const struct board *b, uint8_t *wire, uint8_t type, const uint8_t *body, size_t n);
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n);

@@ -7,9 +7,10 @@
 #define ENTROPY_TRIES 16u
 #define INDEX_MAX UINT32_MAX
 #define CAPABILITY_KEY_EDGE 1u
+#define CAPABILITY_XY2_100 2u
 #define MS 1000u
 
-static bool inputs_safe(const struct board *b) { return find_unsafe_inputs(b->inputs) == 0; }
+static bool inputs_safe(const struct board *b) { return find_unsafe_inputs(b->inputs) == 0 && is_head_ready(b); }
 
 static bool is_armed(const struct board *b) {
     return STATES_ARMED >> b->state & 1u;
@@ -43,7 +44,8 @@ void on_hello(struct board *b, const struct frame *frame) {
     put_u16(body + HELLO_REPLY_SESSION_AT, b->link.session);
     put_u32(body + HELLO_REPLY_FIRMWARE_AT, b->config.firmware);
     memcpy(body + HELLO_REPLY_UID_AT, b->config.uid, sizeof b->config.uid);
-    put_u32(body + HELLO_REPLY_CAPABILITIES_AT, b->config.key_edge ? CAPABILITY_KEY_EDGE : 0);
+    put_u32(body + HELLO_REPLY_CAPABILITIES_AT, (b->config.key_edge ? CAPABILITY_KEY_EDGE : 0) |
+                                                    (b->config.interface == INTERFACE_XY2_100 ? CAPABILITY_XY2_100 : 0));
     put_u32(body + HELLO_REPLY_TICK_HZ_AT, TICK_HZ);
     put_u16(body + HELLO_REPLY_QUEUE_POINTS_AT, b->config.queue_points);
     put_u16(body + HELLO_REPLY_RX_WINDOW_AT, RX_WINDOW);
@@ -84,6 +86,7 @@ static void send_status(struct board *b) {
     put_u16(body + STATUS_UNDERRUNS_AT, (uint16_t)b->underruns_total);
     put_u64(body + STATUS_LASER_ON_US_AT, b->laser_on_duty_us / 65535u);
     put_u16(body + STATUS_TEMPERATURE_DC_AT, (uint16_t)b->hal.read_temperature_dc(b->hal.context));
+    put_u16(body + STATUS_HEAD_AT, b->head);
     send_message(b, MESSAGE_STATUS, body, sizeof body);
 }
 

@@ -47,9 +47,10 @@ enum fault {
     FAULT_READBACK = 12,
     FAULT_CELLS = 13,
     FAULT_PULSES = 14,
+    FAULT_HEAD = 15,
 };
-#define FAULT_COUNT 15u
-#define FAULT_NAMES {"", "LINK", "RANGE", "ON_TIME", "DUTY", "MEAN_POWER", "SPOT", "UNDERRUN", "INTERLOCK", "KEY", "ESTOP", "TICK", "READBACK", "CELLS", "PULSES"}
+#define FAULT_COUNT 16u
+#define FAULT_NAMES {"", "LINK", "RANGE", "ON_TIME", "DUTY", "MEAN_POWER", "SPOT", "UNDERRUN", "INTERLOCK", "KEY", "ESTOP", "TICK", "READBACK", "CELLS", "PULSES", "HEAD"}
 
 enum nak {
     NAK_SEQUENCE = 0,
@@ -270,7 +271,8 @@ enum reason {
 #define STATUS_UNDERRUNS_AT 23u
 #define STATUS_LASER_ON_US_AT 25u
 #define STATUS_TEMPERATURE_DC_AT 33u
-#define STATUS_SIZE 35u
+#define STATUS_HEAD_AT 35u
+#define STATUS_SIZE 37u
 
 #define TRIGGERS_COUNT_AT 0u
 #define TRIGGERS_TICK_AT 4u

@@ -36,7 +36,7 @@ static void begin_point(struct board *b) {
 }
 
 static void begin_pulse(struct board *b) {
-    enum fault fault = MUTANT == 105 ? FAULT_NONE : find_input_fault(find_unsafe_inputs(b->inputs));
+    enum fault fault = MUTANT == 105 ? FAULT_NONE : find_unsafe(b);
     if (fault == FAULT_NONE) {
         fault = guards_accept_pulse(&b->guards, &b->limits, &b->config, &b->current_point, b->now_us);
     }

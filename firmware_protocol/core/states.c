@@ -15,6 +15,17 @@ enum fault find_input_fault(uint8_t unsafe) {
     return unsafe & INPUT_INTERLOCK ? FAULT_INTERLOCK : unsafe & INPUT_KEY ? FAULT_KEY : FAULT_ESTOP;
 }
 
+#define HEAD_READY 0xc000u /* power and temperature */
+
+bool is_head_ready(const struct board *b) {
+    return MUTANT == 16 || b->config.interface != INTERFACE_XY2_100 || (b->head & HEAD_READY) == HEAD_READY;
+}
+
+enum fault find_unsafe(const struct board *b) {
+    enum fault fault = find_input_fault(find_unsafe_inputs(b->inputs));
+    return fault == FAULT_NONE && !is_head_ready(b) ? FAULT_HEAD : fault;
+}
+
 size_t encode_message(const struct board *b, uint8_t *wire, uint8_t type, const uint8_t *body, size_t n) {
     return b->link.session ? frame_encode(wire, type, 0, b->link.session, body, n) : 0;
 }

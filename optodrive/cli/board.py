@@ -38,6 +38,7 @@ def _describe(config: "Config", settings: "PicoSettings") -> list[str]:
     return [
         f"{'uid':<17}{settings.uid}{remark}",
         f"{'gate':<17}PWM at {settings.gate_hz} Hz",
+        f"{'mirrors':<17}{settings.interface}",
         *(f"{name:<17}{origin}" for name, origin in list_origins(config).items()),
     ]
 

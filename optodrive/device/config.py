@@ -37,6 +37,9 @@ VERSION = 1
 DAMPING_MAX = 0.995
 """Largest damping ratio of a servo with two poles that ring."""
 
+XY2_100_DELAY_S = 2e-5
+"""Longest time from a move to the end of the frame that carries it."""
+
 
 class Config(Section):
     """The configuration of one display."""
@@ -157,6 +160,7 @@ class Config(Section):
         self._check_damping()
         self._check_trajectories()
         self._check_converter_codes()
+        self._check_interface()
 
     def _check_reach(self) -> None:
         for stage in self.stages[:1]:
@@ -208,6 +212,16 @@ class Config(Section):
         if self.scanner.half_range_codes != steps:
             expected = f"{steps}, the converter's steps behind board.transport '{self.board.transport}'"
             raise ConflictError("scanner.half_range_codes", self.scanner.half_range_codes, expected)
+
+    def _check_interface(self) -> None:
+        if self.scanner.interface == "analog":
+            return
+        if self.board.is_dac:
+            expected = f"analog, as board.transport '{self.board.transport}' has it"
+            raise ConflictError("scanner.interface", self.scanner.interface, expected)
+        if self.scanner.delay_s < XY2_100_DELAY_S:
+            expected = f"at least {XY2_100_DELAY_S:g}, two frames of scanner.interface 'xy2-100'"
+            raise ConflictError("scanner.delay_s", self.scanner.delay_s, expected)
 
     def list_stage_configs(self) -> tuple["Config", ...]:
         """Return one configuration per stage, whose sections and only stage are its own, or itself without stages."""

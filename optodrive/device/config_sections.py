@@ -184,6 +184,9 @@ class ScannerSection(ServoSection):
     """File of measured servos that replace the stated one, relative to the configuration's folder."""
     trajectories: Literal["steps", "early_steps"] = "steps"
     """When a step to the next pixel is sent: as the light ends, or as early as the focus stays on the absorber."""
+    interface: Literal["analog", "xy2-100"] = "analog"
+    """How the board moves the mirrors: by two voltages, or by frames of XY2-100. A move takes up to two frames, 20 µs
+    that delay_s includes."""
     half_range_codes: int = HALF_RANGE_CODES
     """Codes of the converter from the centre to the end of the range: 32767, for a laser DAC 2047."""
 

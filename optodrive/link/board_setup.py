@@ -36,12 +36,13 @@ def build_port_settings(config: Config) -> PortSettings:
     A simulated board is built for the display: its own limits are those that the display requires, and no pixel shares
     a cell of its spot guards with another. Its range of the mirrors is that of the scanner.
     """
-    board, own_settings = config.board, {}
+    board, own_settings = config.board, dict[str, int | str]()
     if board.transport == "simulated":
         requirements = build_board_requirements(config)
         limits = permit_retiming(requirements.limits)
         own_settings = {name: value for name, value in asdict(limits).items() if name not in MIRROR_RANGE}
         own_settings["cell_codes"] = min(SIMULATED_CELL_MAX_CODES, requirements.cell_max_codes)
+        own_settings["interface"] = config.scanner.interface
         own_settings["cells"] = max(SIMULATED_CELLS, requirements.pixels)
     address = {field.name: getattr(board, field.name) for field in fields(PortSettings) if hasattr(board, field.name)}
     return PortSettings(**address, own_settings=own_settings)
@@ -83,6 +84,7 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
         lease_s=config.board.lease_s,
         baud=config.board.baud,
         uid=config.board.uid,
+        interface=config.scanner.interface,
         values=ConfiguredValues(
             pitch_m=config.display.pitch_m,
             bandwidth_hz=config.scanner.bandwidth_hz,

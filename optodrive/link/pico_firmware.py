@@ -26,6 +26,8 @@ GATE_MIN_HZ, GATE_MAX_HZ = 30_000.0, 488_000.0
 """PWM frequencies of the pin: the readback holds from a pulse to the next, and a period has 256 steps."""
 CHIPS = {"rp2040": "", "rp2350": "pico2"}
 """The chip of a board → the folder and the target of its image."""
+INTERFACES = {"analog": "INTERFACE_ANALOG", "xy2-100": "INTERFACE_XY2_100"}
+"""The interface to the mirrors → its name in the firmware."""
 TOOLS = {"make": "make", "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi", "python3": "python3"}
 """Programs that build an image, by the packages of Debian that have them."""
 
@@ -52,6 +54,7 @@ static const struct board_config SETTINGS = {{
     .cells = BOARD_CELLS,
     .window_pulses = BOARD_PULSES,
     .key_edge = true,
+    .interface = {interface},
 }};
 
 #endif
@@ -61,20 +64,29 @@ static const struct board_config SETTINGS = {{
 class PicoSettings(NamedTuple):
     """The settings of a Pico.
 
-    uid: 24 hexadecimal digits; gate_hz: PWM frequency of the gate, Hz
+    uid: 24 hexadecimal digits; gate_hz: PWM frequency of the gate, Hz; interface: to the mirrors, of the configuration
     """
 
     limits: Limits
     cell_codes: int
     gate_hz: int
     baud: int
+    interface: str
     uid: str
 
     def to_header(self, name: str) -> str:
         """Return settings.h for the display of this name, which may neither end nor begin a comment of C."""
         limits = "\n".join(f"            .{key} = {value}," for key, value in asdict(self.limits).items())
         uid = ", ".join(f"0x{byte:02x}" for byte in bytes.fromhex(self.uid))
-        return HEADER.format(**self._asdict() | {"name": name.replace("/", " "), "limits": limits, "uid": uid})
+        return HEADER.format(
+            **self._asdict()
+            | {
+                "name": name.replace("/", " "),
+                "limits": limits,
+                "uid": uid,
+                "interface": INTERFACES[self.interface],
+            }
+        )
 
 
 def build_pico_settings(config: Config, margin_m: float, uid: str) -> PicoSettings:
@@ -95,6 +107,7 @@ def build_pico_settings(config: Config, margin_m: float, uid: str) -> PicoSettin
         cell_codes=min(SIMULATED_CELL_MAX_CODES, requirements.cell_max_codes),
         gate_hz=_choose_gate_hz(config.laser.pwm_hz),
         baud=config.board.baud,
+        interface=config.scanner.interface,
         uid=config.board.uid.lower() or uid,
     )
 

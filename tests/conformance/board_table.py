@@ -24,6 +24,7 @@ ENFORCED = {
     "B13": "invalid frames change only counters",
     "B14": "self-monitoring of tick and gate",
     "B15": "watchdog whose reset turns the gate off",
+    "B16": "scan head that is not ready",
 }
 
 
@@ -41,7 +42,10 @@ def scenarios_of(guard):
 
 def row(guard):
     """Return a row of the table."""
-    boards = [*(kind.name for kind in PROCESS_KINDS if has_subject(kind.name, guard)), "qemu", "pico"]
+    boards = [
+        *(kind.name for kind in PROCESS_KINDS if has_subject(kind.name, guard)),
+        *(chip for chip in ("qemu", "pico", "pico-xy2") if has_subject(chip, guard)),
+    ]
     broken = Counter(mutant.board for mutant in MUTANTS if mutant.guard == guard)
     killed = ", ".join(f"{board.replace('c', 'C')} {count}" for board, count in broken.items())
     return f"| {guard} | {ENFORCED[guard]} | {scenarios_of(guard)} | {', '.join(boards)} | {killed} |"

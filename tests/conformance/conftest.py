@@ -10,15 +10,15 @@ from virtual_board import EmulatedBoard, PicoBoard, VirtualKind
 
 sys.path.append(str(Path(__file__).parents[1] / "pico"))
 
-from emulated_pico import EmulatedPico, PicoImage
+from emulated_pico import EmulatedDigitalPico, EmulatedPico, PicoImage
 from emulated_usb_pico import EmulatedUsbPico
 
 from c_core import InterruptedCBoard, SeededCBoard, build_library
 from firmware_ports import build_emulated_chip
 from optodrive.link.simulator.board_core import BoardCore
 
-PICOS = {"pico": EmulatedPico, "pico-usb": EmulatedUsbPico}
-"""The Pico by the port of its host."""
+PICOS = {"pico": EmulatedPico, "pico-usb": EmulatedUsbPico, "pico-xy2": EmulatedDigitalPico}
+"""The Pico by the port of its host, or with a digital scan head."""
 
 
 @pytest.fixture(scope="session")

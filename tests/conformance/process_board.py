@@ -12,8 +12,8 @@ from forked_process import SIMULATED, start_process
 from optodrive.core.clock import MonotonicClock
 
 READ_WAIT_S = 0.005
-NOT_ITS_OWN = {"python": ("B14", "B15")}
-"""Guards that a kind of board lacks: the simulated one has no tick, readback or watchdog of its own."""
+NOT_ITS_OWN = {"python": ("B14", "B15", "B16"), **dict.fromkeys(("qemu", "pico", "pico-usb"), ("B16",))}
+"""Guards that a kind of board lacks: the simulated one has no tick, readback or watchdog, and most no scan head."""
 
 
 def has_subject(name, subject):

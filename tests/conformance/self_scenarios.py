@@ -1,6 +1,6 @@
-"""Scenarios of B14 and B15: a board with an internal fault turns the gate off and reports it."""
+"""Scenarios of B14 to B16: a board with an internal fault or a broken scan head turns the gate off and reports it."""
 
-from bench import BRIGHT, act, here
+from bench import BRIGHT, PATIENT, act, here
 from guard_scenarios import is_off_by
 from link_scenarios import assert_no_session
 from scenario import scenario
@@ -9,9 +9,9 @@ WATCHDOG = 3
 """Reset cause in HELLO_REPLY."""
 
 
-def failing(bench, action):
-    """Run a job of nine seconds and break a part of the board."""
-    host = bench.ready(act(action), **BRIGHT)
+def failing(bench, action, *steps, **limits):
+    """Run a job of nine seconds and break a part of the board. steps: that follow"""
+    host = bench.ready(act(action), *steps, **BRIGHT, **limits)
     assert host.play(*[here(10_000, dark_us=10_000, duty=2000)] * 450, end=False) == []
     host.wait(host.board.is_gate_on, "light")
     host.board.next_step()
@@ -83,3 +83,46 @@ def stopped_main_loop_ends_in_a_reset_that_hello_reports(bench):
     assert host.hello().reset_cause == WATCHDOG
     assert host.status().state == "DISARMED"
     assert host.arm().status().state == "ARMED"
+
+
+# --- B16 ------------------------------------------------------------------------------------------------------------
+
+HEADS = {"a head that falls silent": "silence_head", "a head that reports a fault": "fail_head"}
+DIGITAL = dict(interface="xy2-100")
+HEAD_READY = 0xC000
+
+
+def repair_head(host):
+    """Carry out the step that repairs the head, and wait for a status that says so."""
+    assert host.status().head & HEAD_READY != HEAD_READY
+    host.board.next_step()
+    host.wait(lambda: host.status().head & HEAD_READY == HEAD_READY, "a head that is ready")
+
+
+@scenario("B16", HEADS)
+def head_that_is_not_ready_is_a_fault_until_it_is_again(bench, action):
+    host = failing(bench, action, act("repair"), **DIGITAL)
+    host.wait_for_change("fault")
+    assert host.board.faults() == ["HEAD"]
+    assert is_off_by(host.board, host.board.of("state")[-1])
+    assert (host.status().state, host.status().fault) == ("FAULT", "HEAD")
+    assert host.send_checked("CLEAR_FAULT") == ["INPUT"]
+    repair_head(host)
+    assert (host.status().state, host.status().fault) == ("FAULT", "HEAD"), "latched"
+    assert host.send_checked("CLEAR_FAULT") == []
+    assert host.arm().status().state == "ARMED"
+
+
+@scenario("B16", HEADS)
+def head_that_is_not_ready_at_power_up_prevents_arming_without_a_fault(bench, action):
+    host = bench.greeted(act(action), act("reset"), act("repair"), **PATIENT, **DIGITAL)
+    board = host.board
+    board.next_step()
+    host.wait_for_change("fault")
+    board.next_step()
+    host.wait(lambda: [state for state, _ in board.states()] == ["DISARMED", "FAULT", "DISARMED"], "the reset")
+    assert host.hello().capabilities & 2
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["INPUT"]
+    repair_head(host)
+    assert host.arm().status().state == "ARMED"
+    assert board.faults() == ["HEAD"], "the one from before the reset"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mutants
 import pytest
 from all_scenarios import GUARD_MODULES, SCENARIOS
-from process_board import ProcessKind
+from process_board import ProcessKind, has_subject
 from scenario import AT_ONCE, GUARDS, judge
 
 
@@ -61,7 +61,8 @@ def test_caught(mutant, virtual, monkeypatch):
 @pytest.mark.parametrize("guard", GUARDS)
 def test_caught_on_the_emulated_pico(guard, virtual):
     mutant = Mutant("pico", guard, guard.removeprefix("B"))
-    assert_caught(mutant, caught_by(virtual("pico", int(mutant.name)), guard))
+    kind = "pico" if has_subject("pico", guard) else "pico-xy2"
+    assert_caught(mutant, caught_by(virtual(kind, int(mutant.name)), guard))
 
 
 @pytest.fixture(scope="module")

@@ -34,6 +34,12 @@ def test_emulated_pico_conforms(case, virtual):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("case", list_cases("pico-xy2"), ids=name_case)
+def test_emulated_pico_with_a_digital_head_conforms(case, virtual):
+    judge(virtual("pico-xy2"), case)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("case", list_of_a_port(), ids=name_case)
 def test_emulated_pico_conforms_on_its_usb_port(case, virtual):
     judge(virtual("pico-usb"), case)

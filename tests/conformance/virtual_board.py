@@ -15,6 +15,8 @@ ADVANCE_US = 5000
 WATCHDOG_US = 50_000
 WATCHDOG_CAUSE = 3
 LATE_TICK_US = 1000
+HEADS = {"silence_head": 0, "fail_head": 0x7D7D, "repair": 0xFDFD}
+"""Status that the scan head then returns: none, one without power, or one in order."""
 BYTE_S = 10 / 1_000_000
 """Time of a byte on the line."""
 
@@ -114,6 +116,8 @@ class VirtualBoard(BoardLog):
             self._tick_stopped = True
         elif step["do"] == "late_tick":
             self._resumes_us = now_us + LATE_TICK_US
+        elif step["do"] in HEADS:
+            self.core.set_head(HEADS[step["do"]])
         else:
             assert step["do"] == "stick_gate"
             self.core.stick(stuck=True, on=self.core.gate_output)

@@ -21,7 +21,7 @@ struct shim {
     uint64_t now_us, fed_us;
     uint8_t inputs;
     uint8_t stuck, stuck_on, gate_on, indicator, relay, interrupted;
-    uint16_t x, y;
+    uint16_t x, y, head; /* head: its status, 0: silent */
     uint32_t triggers;
     uint64_t trigger_us;
     uint8_t out[OUT_MAX];
@@ -58,6 +58,10 @@ static uint32_t read_triggers(void *context, uint64_t *last_us) {
     bool is_pending = s->triggers > 0 && s->now_us <= s->trigger_us; /* a tick at the very time of the edge misses it */
     *last_us = is_pending ? *last_us : s->trigger_us;
     return s->triggers - is_pending;
+}
+static bool read_head(void *context, uint16_t *status) {
+    *status = ((struct shim *)context)->head;
+    return *status != 0;
 }
 static void set_indicator(void *context, bool on) { ((struct shim *)context)->indicator = on; }
 static void set_relay(void *context, bool closed) { ((struct shim *)context)->relay = closed; }
@@ -96,14 +100,16 @@ static void trace(void *context, const struct board_trace *event) {
 }
 
 struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_codes, uint32_t queue_points,
-                      uint32_t cells, uint32_t window_pulses, uint32_t key_edge) {
+                      uint32_t cells, uint32_t window_pulses, uint32_t key_edge, uint32_t interface) {
     struct shim *s = calloc(1, sizeof *s);
+    s->head = 0xfdfdu;
     s->inputs = INPUT_INTERLOCK | INPUT_KEY;
     s->hal = (struct board_hal){.context = s,
                                 .set_gate = set_gate,
                                 .read_gate = read_gate,
                                 .move_mirrors = move_mirrors,
                                 .read_inputs = read_inputs,
+                                .read_head = read_head,
                                 .read_triggers = read_triggers,
                                 .set_indicator = set_indicator,
                                 .set_relay = set_relay,
@@ -122,6 +128,7 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
     s->config.cells = (uint16_t)cells;
     s->config.window_pulses = (uint16_t)window_pulses;
     s->config.key_edge = key_edge;
+    s->config.interface = (uint8_t)interface;
     return s;
 }
 
@@ -168,6 +175,7 @@ void shim_trigger(struct shim *s, uint64_t at_us) {
     s->trigger_us = at_us;
 }
 void shim_set_inputs(struct shim *s, uint32_t inputs) { s->inputs = (uint8_t)inputs; }
+void shim_set_head(struct shim *s, uint32_t status) { s->head = (uint16_t)status; }
 void shim_stick(struct shim *s, uint32_t stuck, uint32_t on) {
     s->stuck = (uint8_t)stuck;
     s->stuck_on = (uint8_t)on;

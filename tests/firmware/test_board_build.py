@@ -3,7 +3,7 @@
 import json
 import re
 import subprocess
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -75,9 +75,20 @@ def test_the_image_has_the_limits_of_its_display_and_its_host_accepts_it(built, 
     assert reply.uid.hex() == UID
     spare_uj = 1.06e6 * loaded.limits.pulse_energy_max_j
     assert loaded.limits.pulse_energy_max_j * 1e6 <= reply.limits.spot_uj <= spare_uj
+    assert reply.capabilities == 1
     assert reply.limits.full_power_uw == round(1e6 * loaded.laser.max_power_w)
+    digital = replace(build_board_requirements(loaded), interface="xy2-100")
+    with pytest.raises(InputError, match=r"scanner\.interface: got 'xy2-100', expected analog, as this board"):
+        digital.check_board(reply)
     with pytest.raises(InputError, match="expected a slower servo"):
         build_board_requirements(load_config("display-16")).check_board(reply)
+
+
+def test_the_settings_state_the_interface(config, capsys):
+    for interface, stated in (("analog", "INTERFACE_ANALOG"), ("xy2-100", "INTERFACE_XY2_100")):
+        path = config(bandwidth_hz=f'interface = "{interface}"\nbandwidth_hz = 1000.0')
+        assert run(["board", "settings", "--config", str(path)]) == 0
+        assert f"    .interface = {stated},\n" in capsys.readouterr().out
 
 
 def test_build_writes_this_image(built, tmp_path, monkeypatch, capsys):
@@ -112,6 +123,10 @@ def test_a_board_without_uid_gets_one_of_its_own(config, capsys):
     ("replaced", "says"),
     [
         ({"pwm_hz": "pwm_hz = 6e5"}, "laser.pwm_hz: got 600000.0, expected a frequency with a multiple from 30 kHz to"),
+        (
+            {"delay_s": 'interface = "xy2-100"\ndelay_s = 1e-5'},
+            "scanner.delay_s: got 1e-05, expected at least 2e-05, two frames of scanner.interface 'xy2-100'",
+        ),
         ({"uid": "zz"}, "board.uid: got 'zz', expected 24 hexadecimal digits"),
         ({"rows": "rows = 40", "columns": "columns = 40", "pitch_m": "pitch_m = 3.0e-3"}, f"at most {CELLS_MAX}"),
     ],

@@ -9,8 +9,8 @@ from itertools import groupby
 
 import numpy as np
 import pytest
-from bench import PATIENT, Bench, act, here
-from emulated_pico import EmulatedPico, PicoImage
+from bench import BRIGHT, PATIENT, Bench, act, here
+from emulated_pico import STATUS_OK, EmulatedDigitalPico, PicoImage, encode_status
 from test_emulated_pico import check_edges
 from virtual_board import PicoBoard, VirtualKind
 
@@ -20,12 +20,12 @@ PIECES, PIECE_S = 6, 10.0
 
 @pytest.fixture(scope="session")
 def image(tmp_path_factory):
-    return PicoImage(tmp_path_factory.mktemp("xy2-100"), interface="xy2-100")
+    return PicoImage(tmp_path_factory.mktemp("xy2-100"))
 
 
 @pytest.fixture
 def bench(image, tmp_path):
-    bench = Bench(VirtualKind("xy2-100", partial(EmulatedPico, image), make_board=PicoBoard), tmp_path)
+    bench = Bench(VirtualKind("xy2-100", partial(EmulatedDigitalPico, image), make_board=PicoBoard), tmp_path)
     yield bench
     bench.finish(lambda board: None)
 
@@ -79,13 +79,87 @@ def test_each_10_us_have_a_frame_with_the_position_of_the_points_even_when_the_c
     ids=["parity inverted", "control bits wrong", "frames dropped", "a bit short"],
 )
 def test_wrong_frames_are_detected(tmp_path, mutant, expected):
-    core = EmulatedPico(PicoImage(tmp_path, mutant, interface="xy2-100"), None, lambda entry: None, 1)
+    core = EmulatedDigitalPico(PicoImage(tmp_path, mutant), None, lambda entry: None, 1)
     core.advance(20_000)
     core.count_frames()
     assert expected <= {what for _, what in core.frame_errors}
     with pytest.raises(AssertionError):
         check_frames(core, 6_000)
     core.close()
+
+
+GOOD = encode_status(STATUS_OK)
+BAD_ANSWERS = {
+    "silent, low": {"frame": None, "line": False},
+    "silent, high": {"frame": None, "line": True},
+    "parity": {"frame": GOOD ^ 1},
+    "control bits": {"frame": GOOD ^ 3 << 17},
+    "no power": {"frame": encode_status(STATUS_OK & ~0x8080)},
+    "too warm": {"frame": encode_status(STATUS_OK & ~0x4040)},
+}
+HEAD_MAX_US = 200
+
+
+def change_answer(host, kind, wait_us):
+    """Let the head of an idle board answer badly after a time. Return how long the fault took, µs."""
+    core, log = host.board.core, host.board
+    core.advance(host.clock.now_us() + wait_us)
+    count, since_us = len(log.of("fault")), core.chip_us
+    core.answer(**BAD_ANSWERS[kind])
+    core.advance(since_us + HEAD_MAX_US + FRAME_US)
+    assert [each["fault"] for each in log.of("fault")[count:]] == ["HEAD"], kind
+    return log.of("fault")[-1]["t_us"] - since_us
+
+
+def repair(host):
+    """Let the head answer as it did, and clear the fault."""
+    host.board.core.answer(frame=GOOD)
+    host.pause(0.001)
+    assert host.send_checked("CLEAR_FAULT") == []
+
+
+def test_each_bad_status_is_a_fault_within_200_us_and_a_single_one_is_none(bench):
+    host = bench.greeted()
+    core = host.board.core
+    slowest_us = 0
+    for kind in BAD_ANSWERS:
+        for wait_us in range(0, 100, 17):
+            slowest_us = max(slowest_us, change_answer(host, kind, wait_us))
+            repair(host)
+    print(f"fault HEAD after {slowest_us} µs at most")
+    assert slowest_us <= HEAD_MAX_US
+    faults = len(host.board.of("fault"))
+    for _ in range(50):
+        core.answer(bad=1)
+        core.advance(core.chip_us + 137)
+    assert len(host.board.of("fault")) == faults
+    assert host.status().head == STATUS_OK
+
+
+def test_a_board_that_ignores_the_status_is_detected(tmp_path):
+    kind = VirtualKind("mutant", partial(EmulatedDigitalPico, PicoImage(tmp_path, 16)), make_board=PicoBoard)
+    bench = Bench(kind, tmp_path)
+    host = bench.greeted()
+    for each in BAD_ANSWERS:
+        with pytest.raises(AssertionError, match=each):
+            change_answer(host, each, 0)
+    bench.finish(lambda board: None)
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(each, marks=() if each == "silent, low" else pytest.mark.slow) for each in BAD_ANSWERS]
+)
+def test_a_head_that_is_not_ready_turns_the_gate_off_within_200_us(bench, kind):
+    host = bench.ready(**BRIGHT)
+    host.shine()
+    core, since_us = host.board.core, host.board.core.chip_us
+    core.answer(**BAD_ANSWERS[kind])
+    core.advance(since_us + 1000)
+    assert host.board.states()[-1] == ("FAULT", "fault")
+    off_us, is_on, _ = core.pins[-1]
+    assert not is_on
+    assert 0 < off_us - since_us <= HEAD_MAX_US
+    print(f"gate off {off_us - since_us:.0f} µs after the status")
 
 
 @pytest.mark.slow

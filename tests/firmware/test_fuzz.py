@@ -71,6 +71,7 @@ def test_what_was_found_is_mended(folder, what):
         pytest.param(*("board", 3, "oracle: B3: "), marks=pytest.mark.slow),
         pytest.param(*("board", 7, "oracle: B7: "), marks=pytest.mark.slow),
         ("board", 9, "oracle: B9: "),
+        pytest.param(*("board", 16, "oracle: B9: "), marks=pytest.mark.slow),
         ("decoder", 101, "AddressSanitizer: heap-buffer-overflow"),
         pytest.param(*("decoder", 102, "out of bounds for type 'uint8_t[253]'"), marks=pytest.mark.slow),
     ],

@@ -209,7 +209,7 @@ export class Board {
       queued: machine.queue.length, crc_errors: modulo16(errors.crc_errors),
       format_errors: modulo16(errors.format_errors), seq_errors: modulo16(errors.seq_errors),
       underruns: modulo16(machine.underruns), laser_on_us: Math.floor(machine.laserOnTimesDuty / 65535),
-      temperature_dc: TEMPERATURE_DC,
+      temperature_dc: TEMPERATURE_DC, head: 0,
     });
   }
 

@@ -15,10 +15,12 @@ import tempfile
 import weakref
 from collections import deque
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from firmware_ports import require
 from optodrive.link.protocol import messages as m
+from optodrive.link.simulator.guards import INTERFACES, BoardSettings
 
 HERE = Path(__file__).parent
 PORT = HERE.parents[1] / "firmware_protocol" / "ports" / "rp2040"
@@ -44,14 +46,27 @@ SYMBOLS = (
 )
 INPUT_PINS = {"interlock": 10, "key": 9, "estop": 8}
 HOST_CLOSED, TRIGGER = 2, 20
-ENUMERATORS = {"analog": "INTERFACE_ANALOG", "xy2-100": "INTERFACE_XY2_100"}
-INTERFACES = tuple(ENUMERATORS)
+STATUS_OK = 0xFDFD
+"""Of a scan head: power, temperature and positions in order."""
 PULSE_US = 2
 PWM_STEPS, DUTY_FULL = 2500, 65535
 BY_POINT, BY_RESET = -1, -2
 LATE_TICK_US = 700
 LOOP_US = 300
 """The port's main loop turns within this time."""
+
+
+def encode_status(word):
+    """Return the frame of a scan head's status: control bits 001, 16 bits, even parity."""
+    bits = 1 << 17 | word << 1
+    return bits | bits.bit_count() % 2
+
+
+ANSWERS = {
+    "silence_head": {"frame": None, "line": False},
+    "fail_head": {"frame": encode_status(STATUS_OK & 0x7F7F)},
+    "repair": {"frame": encode_status(STATUS_OK)},
+}
 
 
 def require_emulator():
@@ -88,15 +103,11 @@ class PicoImage:
 
     mutant: number of the disabled guard
     port: folder of the sources
-    interface: of its settings, to the mirrors
     """
 
-    def __init__(self, folder, mutant=0, port=PORT, interface="analog"):
+    def __init__(self, folder, mutant=0, port=PORT):
         require_emulator()
-        self._interface = INTERFACES.index(interface)
-        settings = folder / "settings.h"
-        settings.write_text((port / "settings.h").read_text().replace("INTERFACE_ANALOG", ENUMERATORS[interface]))
-        build = ["make", "-s", "-C", port, f"BUILD={folder}", f"MUTANT={mutant}", f"SETTINGS={settings}"]
+        build = ["make", "-s", "-C", port, f"BUILD={folder}", f"MUTANT={mutant}"]
         subprocess.run(build, check=True, stdout=subprocess.DEVNULL)
         self.flash = read_uf2(folder / "board.uf2")
         self.symbols = {name: read_symbols(folder / "board.elf")[name] for name in SYMBOLS}
@@ -109,7 +120,7 @@ class PicoImage:
         limits = vars(settings.limits).values()
         uid = bytes.fromhex(settings.uid)
         sizes = settings.cell_codes, settings.queue_points, settings.cells, settings.window_pulses
-        packed = SETTINGS.pack(*limits, uid, FIRMWARE, *sizes, settings.key_edge, self._interface)
+        packed = SETTINGS.pack(*limits, uid, FIRMWARE, *sizes, settings.key_edge, INTERFACES.index(settings.interface))
         return self.flash[:at] + packed + self.flash[at + len(packed) :]
 
 
@@ -117,7 +128,7 @@ class EmulatedPico:
     """A Pico with its circuit. settings: None for those of the image. sink: receives each log event."""
 
     lease_until_us = 0
-    FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate")
+    FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate", *ANSWERS)
 
     def __init__(self, image, settings, sink, seed=None):
         self._sink, self._now_us, self.chip_us = sink, 0, 0.0
@@ -213,7 +224,10 @@ class EmulatedPico:
         return
 
     def inject_fault(self, name):
-        """Break a part of the board: one of FAULTS."""
+        """Break a part of the board, or its scan head, or repair that: one of FAULTS."""
+        if name in ANSWERS:
+            self.answer(**ANSWERS[name])
+            return
         self._command("inject", name)
 
     def measure_ticks(self):
@@ -320,6 +334,13 @@ class EmulatedPico:
         if reason != BY_RESET:
             pulse = {"index": index, "x": x, "y": y, "duty": duty, "on_us": on_us, "off_us": at_us}
             self._sink({"t_us": at_us, "event": "pulse", **pulse})
+
+
+class EmulatedDigitalPico(EmulatedPico):
+    """A Pico with a digital scan head, by XY2-100."""
+
+    def __init__(self, image, settings, sink, seed=None):
+        super().__init__(image, replace(settings or BoardSettings(), interface="xy2-100"), sink, seed)
 
 
 def _end(process, path):

@@ -50,6 +50,8 @@ enum step_kind {
     STEP_LATE_TICK,  /* delays the safety tick by a millisecond */
     STEP_STICK_GATE, /* freezes the gate's readback until repair */
     STEP_TRIGGER,    /* an edge at the trigger input */
+    STEP_SILENCE_HEAD, /* the scan head returns no status until repair */
+    STEP_FAIL_HEAD,    /* its status says that its power is not in order, until repair */
 };
 
 struct step {
@@ -132,6 +134,7 @@ struct port {
     uint8_t inputs;
     uint32_t triggers; /* edges so far */
     uint64_t trigger_us;
+    uint16_t head; /* its status, 0: silent */
     bool gate_on, readback_stuck, readback_value, loop_stopped, tick_stopped;
 };
 

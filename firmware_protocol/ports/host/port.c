@@ -20,6 +20,8 @@
 #define WATCHDOG_US 50000u
 #define LATE_TICK_US 1000u
 #define TIMER_SLACK_NS 1000ul
+#define HEAD_OK 0xfdfdu    /* power, temperature, positions */
+#define HEAD_POWER 0x8080u
 
 static volatile sig_atomic_t stopped, signals;
 
@@ -54,6 +56,11 @@ static bool read_gate(void *context) {
 static void move_mirrors(void *context, uint16_t x, uint16_t y) { (void)context, (void)x, (void)y; }
 static void ignore_output(void *context, bool on) { (void)context, (void)on; }
 static uint8_t read_inputs(void *context) { return ((struct port *)context)->inputs; }
+static bool read_head(void *context, uint16_t *status) {
+    const struct port *port = context;
+    *status = port->head;
+    return port->head != 0;
+}
 static uint32_t read_triggers(void *context, uint64_t *last_us) {
     const struct port *port = context;
     *last_us = port->trigger_us;
@@ -148,6 +155,7 @@ static void run_step(struct port *port, const struct step *step) {
     case STEP_REPAIR:
         port->line.drop_rate = port->line.flip_rate = 0;
         port->line.hung = port->readback_stuck = false;
+        port->head = HEAD_OK;
         break;
     case STEP_RESET:
         port->line.output_count = 0;
@@ -170,6 +178,12 @@ static void run_step(struct port *port, const struct step *step) {
     case STEP_TRIGGER:
         log_trigger(&port->log, port->at_us, ++port->triggers);
         port->trigger_us = port->at_us;
+        break;
+    case STEP_SILENCE_HEAD:
+        port->head = 0;
+        break;
+    case STEP_FAIL_HEAD:
+        port->head = HEAD_OK & ~HEAD_POWER;
         break;
     case STEP_STICK_GATE:
         port->readback_value = port->gate_on;
@@ -278,6 +292,7 @@ void port_run(struct port *port) {
         .read_gate = read_gate,
         .move_mirrors = move_mirrors,
         .read_inputs = read_inputs,
+        .read_head = read_head,
         .read_triggers = read_triggers,
         .set_indicator = ignore_output,
         .set_relay = ignore_output,
@@ -293,6 +308,7 @@ void port_run(struct port *port) {
     signal(SIGUSR1, on_step_signal);
     prctl(PR_SET_TIMERSLACK, TIMER_SLACK_NS);
     port->inputs = INPUT_INTERLOCK | INPUT_KEY;
+    port->head = HEAD_OK;
     port->started_ns = clock_ns();
     board_init(&port->board, &port->hal, &port->config, RESET_POWER_UP, 0);
     while (!stopped && !port->log.failed) {

@@ -7,10 +7,10 @@
 static const char *const INPUTS[INPUT_COUNT] = INPUT_NAMES;
 static const char *const ACTIONS[] = {"",       "flip_bits", "drop_bytes", "hang",      "repair",
                                       "reset",  "close",     "stop_loop",  "stop_tick", "late_tick", "stick_gate",
-                                      "trigger"};
+                                      "trigger", "silence_head", "fail_head"};
 #define ACTION_NAMES \
     "one of flip_bits, drop_bytes, hang, repair, reset, close, trigger; of this board alone: stop_loop, stop_tick, late_tick, " \
-    "stick_gate"
+    "stick_gate, silence_head, fail_head"
 
 const char *input_name(uint8_t bit) {
     for (size_t k = 0; k < INPUT_COUNT; k++) {

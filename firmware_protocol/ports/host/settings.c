@@ -55,6 +55,18 @@ static void read_uid(struct board_config *config, const char *path, const struct
     }
 }
 
+static uint8_t read_interface(const char *path, const struct toml_entry *entry) {
+    if (entry->kind == TOML_STRING && strcmp(entry->text, "xy2-100") == 0) {
+        return INTERFACE_XY2_100;
+    }
+    if (entry->kind != TOML_STRING || strcmp(entry->text, "analog") != 0) {
+        char where[300];
+        snprintf(where, sizeof where, "%s: interface", path);
+        bad_input(where, entry->raw, "analog or xy2-100");
+    }
+    return INTERFACE_ANALOG;
+}
+
 static bool read_entry(struct board_config *config, const char *path, const struct toml_entry *entry) {
 #define READ(name, bits, at, way) \
     if (strcmp(entry->key, #name) == 0) { \
@@ -80,6 +92,8 @@ static bool read_entry(struct board_config *config, const char *path, const stru
             bad_input(where, entry->raw, "true or false");
         }
         config->key_edge = entry->boolean;
+    } else if (strcmp(entry->key, "interface") == 0) {
+        config->interface = read_interface(path, entry);
     } else {
         return false;
     }
@@ -94,7 +108,8 @@ void settings_read(struct board_config *config, const char *path) {
         if (toml->entries[k].table || !read_entry(config, path, &toml->entries[k])) {
 #define NAME(name, bits, at, way) #name ", "
             bad_input(path, toml->entries[k].key,
-                      "a known key: one of " LIMITS_FIELDS(NAME) "uid, cell_codes, queue_points, cells, window_pulses, key_edge");
+                      "a known key: one of " LIMITS_FIELDS(NAME) "uid, cell_codes, queue_points, cells, window_pulses, key_edge, "
+                      "interface");
         }
     }
     if (toml->tables) {

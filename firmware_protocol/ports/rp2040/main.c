@@ -7,10 +7,12 @@
 #include "outputs.h"
 #include "pins.h"
 #include "settings.h"
+#include "xy2_100.h"
 
 #define LOOP_BYTES_MAX 64u
 
 static struct board board;
+static const struct board_config *const volatile settings = &SETTINGS; /* read from memory: an image's may be replaced */
 static uint64_t last_tick_us;
 
 /* --- the HAL --- */
@@ -25,12 +27,16 @@ static bool read_gate(void *context) {
 }
 static void move_mirrors(void *context, uint16_t x, uint16_t y) {
     (void)context;
-    outputs_move_mirrors(SETTINGS.interface, x, y);
+    outputs_move_mirrors(settings->interface, x, y);
 }
 static uint8_t read_inputs(void *context) {
     (void)context;
     return (uint8_t)((outputs_get(PIN_INTERLOCK) ? INPUT_INTERLOCK : 0) | (outputs_get(PIN_KEY) ? INPUT_KEY : 0) |
                      (outputs_get(PIN_ESTOP) ? 0 : INPUT_ESTOP));
+}
+static bool read_head(void *context, uint16_t *status) {
+    (void)context;
+    return xy2_100_read_status(status);
 }
 static uint32_t read_triggers(void *context, uint64_t *last_us) {
     (void)context;
@@ -79,6 +85,7 @@ static const struct board_hal HAL = {
     .read_gate = read_gate,
     .move_mirrors = move_mirrors,
     .read_inputs = read_inputs,
+    .read_head = read_head,
     .read_triggers = read_triggers,
     .set_indicator = set_indicator,
     .set_relay = set_relay,
@@ -125,11 +132,11 @@ static bool run_loop_once(void) {
 int main(void) {
     enum reset_cause cause = chip_reset_cause();
     chip_start(on_alarm);
-    outputs_start(SETTINGS.interface);
+    outputs_start(settings->interface);
     chip_start_trigger(PIN_TRIGGER);
-    host_start(SETTINGS.uid);
+    host_start(settings->uid);
     last_tick_us = chip_now_us();
-    board_init(&board, &HAL, &SETTINGS, cause, last_tick_us);
+    board_init(&board, &HAL, settings, cause, last_tick_us);
     chip_start_watchdog();
     set_alarm();
     chip_release_alarm();

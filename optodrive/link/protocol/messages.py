@@ -33,12 +33,14 @@ FAULTS = (
     "READBACK",
     "CELLS",
     "PULSES",
+    "HEAD",
 )
 NAK_REASONS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")
 NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
 """NAK reasons after which the host resends the same frame. Any other reason consumes the frame's sequence number."""
 EVENT_REASONS = tuple(EventReason)
 INPUTS = ("interlock", "key", "estop")
+CAPABILITY_KEY_EDGE, CAPABILITY_XY2_100 = 1, 2
 
 POINT = struct.Struct("<HHHHH")
 """x, y (DAC codes), dark_us (gate off before the pulse), on_us (gate on), duty (1/65535)."""
@@ -338,7 +340,7 @@ class Event(
 
 
 @dataclass(frozen=True)
-class Status(Message, name="STATUS", type_id=0x98, layout="<BBBQIHHHHHQh", enums={"state": STATES, "fault": FAULTS}):
+class Status(Message, name="STATUS", type_id=0x98, layout="<BBBQIHHHHHQhH", enums={"state": STATES, "fault": FAULTS}):
     """Report state, inputs and counters of the board."""
 
     state: int
@@ -353,6 +355,7 @@ class Status(Message, name="STATUS", type_id=0x98, layout="<BBBQIHHHHHQh", enums
     underruns: int
     laser_on_us: int
     temperature_dc: int
+    head: int
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,7 @@ class BoardRequirements:
     pixels: number of pixels that its spot guards must tell apart
     lease_s: time for which the board may emit without a renewal by the host
     baud: bit rate of the port, 1/s; uid: the only board that is accepted, hexadecimal, '' for any
+    interface: by which the board moves the mirrors, of the configuration
     """
 
     limits: m.Limits
@@ -102,6 +103,7 @@ class BoardRequirements:
     lease_s: float
     baud: int
     uid: str
+    interface: str
     values: ConfiguredValues
 
     @property
@@ -126,6 +128,10 @@ class BoardRequirements:
         if self.uid and peer.uid.hex() != self.uid.lower():
             expected = f"the board of this uid; the connected one has '{peer.uid.hex()}'"
             raise InputError("board.uid", self.uid, expected, "board")
+        interface = "xy2-100" if peer.capabilities & m.CAPABILITY_XY2_100 else "analog"
+        if interface != self.interface:
+            expected = f"{interface}, as this board's firmware has it (by `optodrive board build`)"
+            raise InputError("scanner.interface", self.interface, expected, "board")
         if peer.tick_hz != TICK_HZ:
             raise InputError("board tick_hz", peer.tick_hz, f"{TICK_HZ}", "board")
         limits, requested = peer.limits, self.limits

@@ -15,7 +15,7 @@ from optodrive.link.protocol.connection import WINDOW, BoardLink
 from optodrive.link.protocol.framing import Frame, encode_frame
 from optodrive.link.protocol.states import BoardState, EventReason
 from optodrive.link.simulator.board_machine import BoardMachine, LogSink, MirrorSink
-from optodrive.link.simulator.guards import BoardSettings
+from optodrive.link.simulator.guards import INTERFACES, BoardSettings
 
 WANDER_PERIOD_S = 600.0
 
@@ -49,8 +49,9 @@ EXACT_CLOCK = BoardClock()
 
 TICK_HZ = 1_000_000
 FIRMWARE = 0x0001_0000
-CAPABILITY_KEY_EDGE = 1
 TEMPERATURE_DC = 250
+HEAD_OK = 0xFDFD
+"""Status of a scan head: power, temperature and positions in order."""
 
 
 class BoardCore:
@@ -68,6 +69,7 @@ class BoardCore:
         mirror_sink: MirrorSink | None = None,
     ) -> None:
         self._settings = settings or BoardSettings()
+        self._is_digital = self._settings.interface != INTERFACES[0]
         self._sink: LogSink = sink or (lambda event: None)
         self._random = random.Random(seed)
         self.read_present_us: Callable[[], int] = lambda: self.machine.now_us
@@ -243,7 +245,7 @@ class BoardCore:
                 session=session,
                 firmware=FIRMWARE,
                 uid=bytes.fromhex(self._settings.uid),
-                capabilities=CAPABILITY_KEY_EDGE if self._settings.key_edge else 0,
+                capabilities=m.CAPABILITY_KEY_EDGE * self._settings.key_edge + m.CAPABILITY_XY2_100 * self._is_digital,
                 tick_hz=TICK_HZ,
                 queue_points=self._settings.queue_points,
                 rx_window=WINDOW,
@@ -287,6 +289,7 @@ class BoardCore:
             underruns=machine.underruns_total & 0xFFFF,
             laser_on_us=machine.laser_on_duty_us // 65535,
             temperature_dc=TEMPERATURE_DC,
+            head=HEAD_OK if self._is_digital else 0,
         )
 
     def _send(self, message: m.Message) -> None:

@@ -30,6 +30,8 @@ FIELD_MAX = {"H": 0xFFFF, "I": 0xFFFF_FFFF}
 SETTING_RANGES = {
     item.name: (0, FIELD_MAX[code]) for item, code in zip(fields(Limits), Limits.LAYOUT.format[1:], strict=True)
 }
+INTERFACES = ("analog", "xy2-100")
+"""How a board tells the mirrors their position."""
 CELLS_MAX, WINDOW_PULSES_MAX = 8192, 8192
 SETTING_RANGES |= {"cell_codes": (1, 0xFFFF), "queue_points": (POINTS_MAX, 0xFFFF)}
 SETTING_RANGES |= {"cells": (1, CELLS_MAX), "window_pulses": (1, WINDOW_PULSES_MAX)}
@@ -49,6 +51,7 @@ class BoardSettings:
     """Settings of a simulated board: its own limits, its identity, and the sizes of its guards.
 
     cell_codes: of a cell, in codes; cells: accounts in each grid; window_pulses: pulses in a second
+    interface: one of INTERFACES; the head of a simulated board is always ready
     """
 
     limits: Limits = DEFAULT_LIMITS
@@ -58,6 +61,7 @@ class BoardSettings:
     cells: int = 2048
     window_pulses: int = WINDOW_PULSES_MAX
     key_edge: bool = False
+    interface: str = "analog"
 
 
 def load_settings(path: Path) -> BoardSettings:
@@ -66,7 +70,7 @@ def load_settings(path: Path) -> BoardSettings:
     Raise InputError for an unknown key or a value out of range.
     """
     table = read_toml(path)
-    known = [*SETTING_RANGES, "uid", "key_edge"]
+    known = [*SETTING_RANGES, "uid", "key_edge", "interface"]
     for name, value in table.items():
         if name not in known:
             raise InputError(f"{path}", name, f"a known key, {suggest_nearest(name, known)}")
@@ -84,6 +88,9 @@ def _check_setting(where: str, name: str, value: object) -> None:
     if name == "uid":
         if not isinstance(value, str) or not fullmatch("[0-9a-fA-F]{24}", value):
             raise InputError(where, value, "24 hexadecimal digits")
+    elif name == "interface":
+        if value not in INTERFACES:
+            raise InputError(where, value, " or ".join(INTERFACES))
     elif name == "key_edge":
         if not isinstance(value, bool):
             raise InputError(where, value, "true or false")

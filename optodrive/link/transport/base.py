@@ -29,7 +29,7 @@ class PortSettings:
     vendor_id: int | None = None
     product_id: int | None = None
     serial_number: str = ""
-    own_settings: dict[str, int] = field(default_factory=dict)
+    own_settings: dict[str, int | str] = field(default_factory=dict)
 
 
 ERROR_TEXT_MAX = 200

@@ -29,7 +29,7 @@ class SimulatedBoard(SerialPort):
         self._folder = tempfile.TemporaryDirectory(prefix="optodrive-board-")
         super().__init__(settings.port or str(Path(self._folder.name) / "tty"), settings.baud)
         self._limits = Path(self._folder.name) / "limits.toml"
-        self._limits.write_text("".join(f"{name} = {value}\n" for name, value in settings.own_settings.items()))
+        self._limits.write_text("".join(f"{name} = {value!r}\n" for name, value in settings.own_settings.items()))
         self.log = Path(self._folder.name) / "board.jsonl"
         self.sensor_port = str(Path(self._folder.name) / "sensor")
         self._display, self._stage = display, stage

@@ -41,7 +41,7 @@ static const struct board_config BOARDS_LIMITS[] = {
     {.limits = OWN(.lease_ms = 60000, .spot_uj = 20000, .rest_us = 0), .cell_codes = 7, .queue_points = 30, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES},
     {.limits = OWN(.lease_ms = 60000, .spot_leak_uw = 0, .max_on_us = 65535), .cell_codes = 65535, .queue_points = 24, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES},
     {.limits = OWN(.lease_ms = 1000, .x_max = 50000, .settle_ns_per_code = 2000), .cell_codes = 1, .queue_points = 64, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES,
-     .key_edge = true},
+     .key_edge = true, .interface = INTERFACE_XY2_100},
 };
 
 /* --- the HAL --- */
@@ -62,7 +62,12 @@ static void move_mirrors(void *context, uint16_t x, uint16_t y) {
 }
 static uint8_t read_inputs(void *context) {
     (void)context;
-    return o->inputs;
+    return o->inputs & (uint8_t)~HEAD_READY;
+}
+static bool read_head(void *context, uint16_t *status) {
+    (void)context;
+    *status = o->inputs & HEAD_READY ? 0xfdfdu : 0x7d7du;
+    return true;
 }
 static uint32_t read_triggers(void *context, uint64_t *last_us) {
     (void)context;
@@ -100,6 +105,7 @@ static const struct board_hal HAL = {.set_gate = set_gate,
                                      .read_gate = read_gate,
                                      .move_mirrors = move_mirrors,
                                      .read_inputs = read_inputs,
+                                     .read_head = read_head,
                                      .read_triggers = read_triggers,
                                      .set_indicator = set_indicator,
                                      .set_relay = set_relay,
@@ -367,11 +373,11 @@ static void arm_fully(void) {
 }
 
 static void change_input(void) {
-    uint8_t which = read_u8();
-    oracle_inputs_change(o, o->inputs ^ (uint8_t)(1u << which % 3));
+    uint8_t which = read_u8(), input = (uint8_t)(1u << which % (board->config.interface == INTERFACE_XY2_100 ? 4 : 3));
+    oracle_inputs_change(o, o->inputs ^ input);
     tick();
     if (which & 8) { /* a short change */
-        oracle_inputs_change(o, o->inputs ^ (uint8_t)(1u << which % 3));
+        oracle_inputs_change(o, o->inputs ^ input);
         tick();
     }
 }
@@ -494,7 +500,7 @@ static void step(const struct board_config *config) {
 
 static void begin(const struct board_config *config) {
     memset(&driver, 0, sizeof driver);
-    o->inputs = INPUT_INTERLOCK | INPUT_KEY;
+    o->inputs = INPUT_INTERLOCK | INPUT_KEY | HEAD_READY;
     o->x = o->y = 32768;
     o->now_us = 1000;
     power_up(config);
@@ -502,9 +508,9 @@ static void begin(const struct board_config *config) {
 
 /* Key off at power-up, then on, which is no fault. */
 static void turn_key(const struct board_config *config) {
-    oracle_inputs_change(o, INPUT_INTERLOCK);
+    oracle_inputs_change(o, INPUT_INTERLOCK | HEAD_READY);
     power_up(config);
-    oracle_inputs_change(o, INPUT_INTERLOCK | INPUT_KEY);
+    oracle_inputs_change(o, INPUT_INTERLOCK | INPUT_KEY | HEAD_READY);
     wait(200, true);
 }
 

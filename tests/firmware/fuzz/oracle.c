@@ -4,7 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define SAFE (INPUT_INTERLOCK | INPUT_KEY)
+#define SAFE (INPUT_INTERLOCK | INPUT_KEY | HEAD_READY)
 
 void report_violation(const char *guard, const char *what) {
     fprintf(stderr, "oracle: %s: %s\n", guard, what);

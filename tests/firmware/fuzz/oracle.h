@@ -23,6 +23,8 @@ struct observed_point {
     uint16_t x, y, dark_us, on_us, duty;
 };
 
+#define HEAD_READY 8u /* beside the inputs: the scan head says that power and temperature are in order */
+
 struct oracle {
     struct board_limits own, limits; /* the board's own limits, and the limits in force */
     uint16_t cell_codes;
