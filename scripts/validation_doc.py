@@ -78,7 +78,8 @@ DISCUSSION_SECTION = """\
 FACTS_INTRODUCTION = """\
 # The paper's facts
 
-[Validation](../explanation/validation.md) compares the models with these; `scripts/validation-doc` generates both
+The paper is M. Linnander et al., *Tactile Displays Driven by Projected Light* (arXiv:2410.05494).
+[Validation](../explanation/validation.md) compares the models with its facts; `scripts/validation-doc` generates both
 pages.
 
 ## Rows
