@@ -168,7 +168,7 @@ def first_light(
     """Check the board, centre the mirrors and emit single weak pulses there. The board ends disarmed in every case."""
     from optodrive.cli.commissioning import open_board
     from optodrive.device.config_file import load_config
-    from optodrive.lab.commissioning.exclusive_board import check_spot_power, spot_width_s
+    from optodrive.lab.commissioning.exclusive_board import build_spot, check_spot_power
     from optodrive.lab.commissioning.homing import PULSES_MAX, default_power_w, emit_first_light
 
     loaded = load_config(config).select_stage(stage)
@@ -176,15 +176,16 @@ def first_light(
     check_spot_power(loaded, power_w, "--power-mw")
     if not 1 <= pulses <= PULSES_MAX:
         raise InputError("--pulses", pulses, f"1 to {PULSES_MAX}")
-    duty = power_w / loaded.laser.max_power_w
-    light = f"{format_quantity(power_w, 'W')} ({duty:.2%} duty) for {format_quantity(spot_width_s(loaded), 's')}"
+    spot = build_spot(loaded, power_w)
+    share = f"{spot.power_w / loaded.laser.max_power_w:.2%} of full power"
+    light = f"{format_quantity(spot.power_w, 'W')} ({share}) for {format_quantity(spot.width_s, 's')}"
     confirm_emission(
         yes,
         f"this arms the board and emits {pulses} pulse{'s' if pulses > 1 else ''} of {light} at the centre of the "
         "display. The enclosure is closed, the beam ends on the display or in a beam dump, and goggles are on",
     )
     with (
-        report_steps("first_light", json, {"power_w": power_w}) as report_step,
+        report_steps("first_light", json, spot._asdict()) as report_step,
         open_board(config, stage=stage) as (board, _),
     ):
         emit_first_light(board, power_w, pulses, acknowledge, report_step)

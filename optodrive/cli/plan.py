@@ -48,8 +48,6 @@ def format_plan_summary(summary: "PlanSummary") -> list[str]:
         f"highest          {summary.predicted_max_um:.1f} µm predicted{target}{pixel}",
         f"min headroom     {summary.headroom_min_k:.1f} K below the absorber cap",
     ]
-    if summary.below_threshold:
-        lines.append(f"no light         {summary.below_threshold} pulses are weaker than laser.threshold_w")
     trimmed = summary.trimmed
     if trimmed.pulses:
         reasons = ", ".join(f"{count} by {reason}" for reason, count in trimmed.by_reason.items())

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from optodrive.core.errors import MISSING, InputError, Unquoted
+from optodrive.core.laser_power import find_min_power_w
 from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import ConflictError, Name, Section
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, ReadOnlyArrays
@@ -159,6 +160,7 @@ class Config(Section):
         self._check_focus()
         self._check_damping()
         self._check_trajectories()
+        self._check_modulation()
         self._check_converter_codes()
         self._check_interface()
 
@@ -206,6 +208,16 @@ class Config(Section):
                 "do mirrors and light follow one clock"
             )
             raise ConflictError("scanner.trajectories", self.scanner.trajectories, expected)
+
+    def _check_modulation(self) -> None:
+        if not self.laser.is_on_off:
+            return
+        if self.board.is_dac:
+            expected = f"'pwm' with board.transport '{self.board.transport}', whose points are too long to make heights"
+            raise ConflictError("laser.modulation", self.laser.modulation, expected)
+        if self.limits.power_share not in (0.0, 1.0):
+            expected = "1 with laser.modulation 'on_off', or 0 for no light"
+            raise ConflictError("limits.power_share", self.limits.power_share, expected)
 
     def _check_converter_codes(self) -> None:
         steps = DAC_HALF_RANGE_CODES if self.board.is_dac else HALF_RANGE_CODES
@@ -303,9 +315,12 @@ class Config(Section):
 
     @property
     def min_power_w(self) -> float:
-        """Laser power of the board's smallest duty step, W. The board rounds down."""
-        steps = DAC_POWER_STEPS.get(self.board.transport, POWER_STEPS)
-        return self.laser.max_power_w / steps
+        """Power of the weakest pulse: of the smallest duty step that reaches the laser's threshold, W."""
+        if self.laser.is_on_off:
+            return self.laser.max_power_w
+        laser, steps = self.laser, DAC_POWER_STEPS.get(self.board.transport, POWER_STEPS)
+        # A DAC that may play slower emits less power for longer, and that power must reach the threshold.
+        return self.board.stretch * find_min_power_w(laser.max_power_w, laser.curve, laser.threshold_w, steps)
 
     @property
     def tolerance_rad(self) -> tuple[float, float]:

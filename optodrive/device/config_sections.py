@@ -1,6 +1,7 @@
 """The sections of a configuration and their keys."""
 
 import re
+from itertools import pairwise
 from os.path import realpath
 from typing import Annotated, Literal, NamedTuple, Self
 
@@ -22,6 +23,9 @@ POWER_STEPS = 65_535
 DAC_POWER_STEPS = {"helios": 255, "ether_dream": 4095, "idn": 255}
 """The same of the laser DACs, by transport."""
 NETWORK_DACS = ("ether_dream", "idn")
+ETHER_DREAM_CLOCK_HZ = 24_000_000
+IDN_STRETCH = 1.3
+"""Factor by which OpenIDN's server plays slower while its buffer is almost empty."""
 # Counted by the galvo load, which must hold for the points as they are played.
 DAC_TIMING_SLACK_POINTS = {"helios": 5, "ether_dream": 5, "idn": 6}
 """On a laser DAC a pulse starts up to two points late (rounding; the end of a chunk) and ends up to three points early
@@ -33,6 +37,9 @@ DAC_POINT_EXCESS_S = {"helios": 1e-8, "ether_dream": 5e-8, "idn": 1e-6}
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Duty = Annotated[float, Field(ge=0, le=1)]
+CURVE_ROWS_MAX = 1000
+"""Rows of a laser's curve: more than any power meter's table needs."""
 HalfWidth = Annotated[float, Field(ge=0, le=0.5), PlausibleRange(0.0, 0.5, "1")]
 ServoHalfWidth = Annotated[float, Field(ge=0, le=0.3), PlausibleRange(0.0, 0.3, "1")]
 Pitch = Annotated[Positive, PlausibleRange(1e-4, 0.1, "m")]
@@ -119,11 +126,16 @@ class LaserSection(Section):
     """Incident power at the sample at full duty, W."""
     pwm_hz: Annotated[Positive, PlausibleRange(50.0, 1e7, "Hz")]
     """Frequency of the pulse-width modulation, Hz; pulses below full power are whole periods wide."""
+    modulation: Literal["pwm", "on_off"] = "pwm"
+    """Whether the module takes a PWM, or is on or off: then every pulse has full power, and its width in microseconds
+    makes its energy."""
     whole_periods: bool = True
     """Whether pulses at full power are whole periods wide, too, and not only whole microseconds, as a module that
     modulates by itself needs."""
     threshold_w: Annotated[float, Field(ge=0), PlausibleRange(0.0, 10.0, "W")] = 0.0
-    """Incident power below which the module emits nothing, W, 0 if it has no threshold. Pulses below it are counted."""
+    """Incident power below which the module emits nothing, W, 0 if it has no threshold. No pulse is weaker."""
+    curve: Annotated[tuple[tuple[Duty, NonNegative], ...], Field(max_length=CURVE_ROWS_MAX)] = ()
+    """Pairs of duty and incident power, W, by a power meter, from [0, 0] to [1, max_power_w]; none: in proportion."""
     focus_width_m: FocusSide
     """Width of the focus on the absorber in x, m."""
     focus_height_m: FocusSide
@@ -133,6 +145,36 @@ class LaserSection(Section):
     def _check_threshold(self) -> Self:
         if self.threshold_w >= self.max_power_w:
             raise ConflictError("threshold_w", self.threshold_w, f"less than max_power_w, {self.max_power_w:g}")
+        return self
+
+    @property
+    def is_on_off(self) -> bool:
+        """Whether every pulse has full power."""
+        return self.modulation == "on_off"
+
+    @property
+    def width_steps_hz(self) -> float:
+        """Number of steps of a pulse's width in a second: PWM periods, or microseconds of a laser that is on or off."""
+        return 1e6 if self.is_on_off else self.pwm_hz
+
+    @model_validator(mode="after")
+    def _check_curve(self) -> Self:
+        for row, (before, after) in enumerate(pairwise(self.curve), start=1):
+            if after[0] <= before[0]:
+                raise ConflictError(f"curve[{row}]", list(after), f"a duty above {before[0]:g}, that of the row before")
+            if after[1] < before[1] or before[1] == after[1] > 0.0:
+                raise ConflictError(f"curve[{row}]", list(after), f"more than {before[1]:g} W, as in the row before")
+        if self.curve and self.is_on_off:
+            raise ConflictError("curve", Unquoted(f"{len(self.curve)} rows"), "none with modulation 'on_off'")
+        ends = [0.0, 0.0], [1.0, self.max_power_w]
+        for row, end in zip((0, -1), ends, strict=True) if self.curve else ():
+            if list(self.curve[row]) != end:
+                raise ConflictError(f"curve[{row % len(self.curve)}]", list(self.curve[row]), str(end))
+        dark = [number for number, (duty, power_w) in enumerate(self.curve) if duty > 0.0 == power_w]
+        if dark and self.threshold_w < self.curve[dark[-1] + 1][1]:
+            # Between these two rows the meter has not seen where the light begins.
+            expected = f"at least {self.curve[dark[-1] + 1][1]:g}, the first power above 0 of curve"
+            raise ConflictError("threshold_w", self.threshold_w, expected)
         return self
 
 
@@ -335,6 +377,14 @@ class BoardSection(Section):
         if not self.is_dac:
             return 0.0
         return DAC_TIMING_SLACK_POINTS[self.transport] * self.point_max_s
+
+    @property
+    def stretch(self) -> float:
+        """Largest factor by which a point of the laser DAC may last longer, for which its levels are lower."""
+        if self.transport == "ether_dream":
+            # Sources differ in whether its counter includes its last value.
+            return 1.0 + 1.0 / (ETHER_DREAM_CLOCK_HZ // self.points_per_s)
+        return IDN_STRETCH if self.transport == "idn" else 1.0
 
     @property
     def point_max_s(self) -> float:

@@ -164,7 +164,7 @@ class _ServoMoves:
             tolerance_ratio * tolerance_rad - 0.5 * scanner.rad_per_code for tolerance_rad in config.tolerance_rad
         )
         pitch_rad = config.display.pitch_m / (2.0 * scanner.focal_length_m)
-        min_pulse_s = int(1e6 / config.laser.pwm_hz) * 1e-6
+        min_pulse_s = int(1e6 / config.laser.width_steps_hz) * 1e-6
         return cls(build_servo_range(scanner), pitch_rad, scanner.rad_per_code, (x_rad, y_rad), min_pulse_s)
 
     def settling_s(self, axis: int, min_pitches: float, max_pitches: float, share: float) -> float:

@@ -94,7 +94,11 @@ def plan_first_experiments(display: DisplayModel, pixel: int, neighbour: int) ->
     """
     laser, limits = display.config.laser, display.config.limits
     hold_s = min(0.05, limits.pulse_width_max_s)
-    ladder = [(hold_s, share * laser.max_power_w, pixel, LADDER_REST_S) for share in LADDER]
+    if laser.is_on_off:
+        raise InputError("laser.modulation", laser.modulation, "'pwm': a diagnosis compares several powers")
+    ladder = [
+        (hold_s, max(share * laser.max_power_w, display.config.min_power_w), pixel, LADDER_REST_S) for share in LADDER
+    ]
     if neighbour != pixel:
         ladder.append((hold_s, laser.max_power_w, neighbour, LADDER_REST_S))
     widths = [(min(width_s, hold_s), laser.max_power_w, pixel, WIDTHS_REST_S) for width_s in WIDTHS_S]
@@ -121,7 +125,7 @@ def plan_experiment(display: DisplayModel, name: str, pulses: FloatArray, pixel:
             break
         except RefusedError:
             share *= POWER_STEP
-            if share < POWER_MIN:
+            if share < POWER_MIN or share * pulses[:, 2].min() < display.config.min_power_w:
                 raise
     planned = np.column_stack([plan.start_s - plan.start_s[0] + LEAD_S, plan.width_s, plan.power_w, plan.pixel])
     tail_s = TRAIN_TAIL_S if len(planned) >= TRAIN_PULSES else TAIL_S
@@ -130,10 +134,10 @@ def plan_experiment(display: DisplayModel, name: str, pulses: FloatArray, pixel:
 
 def _plan_pulses(display: DisplayModel, pulses: FloatArray) -> LimitedPlan:
     """Plan single pulses, of whole PWM periods. Raise RefusedError if one exceeds a cap."""
-    pwm_hz = display.config.laser.pwm_hz
+    steps_hz = display.config.laser.width_steps_hz
     trains = []
     for start_s, width_s, power_w, pixel in pulses.tolist():
-        width_s = max(1, round(width_s * pwm_hz)) / pwm_hz
+        width_s = max(1, round(width_s * steps_hz)) / steps_hz
         trains.append(PulseTrain(int(pixel), start_s - pulses[0, 0], width_s, width_s, 0.01, power_w))
     return plan_sequence(display, FrameSequence((), tuple(trains)), *display.build_cold_state(), policy="refuse").plan
 
@@ -320,7 +324,7 @@ class BoardBench:
         values = self._reader.read_recording(count)
         self._rested_s = self.now_s() + REST_S
         scale = board.session.scale
-        executed = jobs[-1].build_executed(experiment.plan, scale.full_power_w, scale.tick_s)
+        executed = jobs[-1].build_executed(experiment.plan, scale)
         if len(executed) != len(experiment.pulses):
             raise RefusedError(f"{experiment.name}: {len(executed)} of {len(experiment.pulses)} pulses were reported")
         start_s = LEAD_S + (executed.on_tick - executed.on_tick[0]) * scale.tick_s

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from optodrive.core.laser_power import find_proportion_excess, find_proportional_power_w
 from optodrive.core.types.arrays import IntArray
 from optodrive.device.config import Config
 from optodrive.device.field_loader import build_settling_table, load_scan_field
@@ -61,6 +62,8 @@ def build_scales(config: Config) -> tuple[WireScale, ...]:
             rad_per_code=stage.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
             full_power_w=stage.laser.max_power_w,
             tick_s=1.0 / TICK_HZ,
+            curve=stage.laser.curve,
+            min_power_w=stage.min_power_w,
             **stage.scanner.wiring._asdict(),
         )
         for stage in config.list_stage_configs()
@@ -132,14 +135,18 @@ def _compute_cell_max(codes: IntArray, adjacent: IntArray, scale: WireScale, con
 
 def _build_limits(config: Config, scale: WireScale, codes: IntArray, margin_codes: int) -> m.Limits:
     limits, (x_codes, y_codes) = config.limits, codes
+    laser = config.laser
+    # The board counts energy in proportion to the duty, and no less than is emitted: of a laser with a curve too much
+    # at some duties, for which its caps leave room.
+    margin = CAP_MARGIN * find_proportion_excess(laser.max_power_w, laser.curve, config.min_power_w)
     settle_us, settle_ns_per_code = _compute_settling(config, scale)
     return m.Limits(
         max_on_us=ceil(limits.pulse_width_max_s * 1e6),
         max_duty=65535,
         mean_duty=65535,
-        spot_uj=ceil(limits.pulse_energy_max_j * 1e6 * CAP_MARGIN),
-        spot_leak_uw=ceil(limits.pixel_mean_power_max_w * 1e6 * CAP_MARGIN),
-        full_power_uw=round(config.laser.max_power_w * 1e6),
+        spot_uj=ceil(limits.pulse_energy_max_j * 1e6 * margin),
+        spot_leak_uw=ceil(limits.pixel_mean_power_max_w * 1e6 * margin),
+        full_power_uw=round(find_proportional_power_w(laser.max_power_w, laser.curve) * 1e6),
         x_min=max(0, int(x_codes.min()) - margin_codes),
         x_max=min(CODE_MAX, int(x_codes.max()) + margin_codes),
         y_min=max(0, int(y_codes.min()) - margin_codes),

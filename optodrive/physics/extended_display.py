@@ -207,6 +207,7 @@ class ExtendedThermalState:
             min(min_periods, drive.max_periods),
             drive.max_periods,
             drive.is_fine,
+            drive.min_duty,
         )
         one = self.pixels.elements[pixel]
         periods, duty = find_shortest_pulse(

@@ -5,7 +5,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.extended_pulses import advance_states, copy_states, peak_after_off_m, set_light
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms
-from optodrive.physics.pulse_for_height import round_us
+from optodrive.physics.pulse_for_height import choose_permitted, round_us
 from optodrive.physics.term import POWER_W
 
 PEAK_TOLERANCE = 1e-5
@@ -42,6 +42,7 @@ def find_shortest_pulse(
     min_periods: int,
     max_periods: int,
     is_fine: bool,
+    min_duty: float,
     peak_after_s: float,
 ) -> tuple[float, float]:
     """Solve as `ExtendedThermalState.solve_pulse`, from the states work[0]. Return 0 periods if no pulse is needed.
@@ -72,14 +73,13 @@ def find_shortest_pulse(
             high = middle
         else:
             low = middle
-    if is_fine and high > min_periods:
+    if is_fine and (high > min_periods or min_duty >= 1.0):
         widths_s = (low * period_s, high * period_s)
         share = _solve_share(pixel, active, c, work, on_states[0], target_m, max_power_w, *widths_s, peak_after_s)
         return 1e-6 * round_us(widths_s[0] + share * period_s) / period_s, 1.0
     width_s = high * period_s
-    return float(high), _solve_share(
-        pixel, active, c, work, on_states[0], target_m, max_power_w, width_s, width_s, peak_after_s
-    )
+    duty = _solve_share(pixel, active, c, work, on_states[0], target_m, max_power_w, width_s, width_s, peak_after_s)
+    return choose_permitted(high, duty, min_periods, min_duty)
 
 
 @kernel

@@ -147,6 +147,7 @@ class NominalThermalState:
             min(min_periods, longest),
             longest,
             drive.is_fine,
+            drive.min_duty,
             float(peak_after_s),
         )
         if periods < 0:
@@ -286,6 +287,7 @@ def solve_pulse_at(
     min_periods: int,
     max_periods: int,
     is_fine: bool,
+    min_duty: float,
     peak_after_s: float,
 ) -> tuple[float, float]:
     """Solve as `solve_pulse`.
@@ -300,7 +302,17 @@ def solve_pulse_at(
     # A dead pixel has κ = 0 and gets an infinite target: no pulse reaches it, and none is asked to.
     target_k = target_m / one.kappa_m_per_k
     return find_shortest_pulse(
-        one, absorber_k, gas_k, target_k, max_power_w, period_s, min_periods, max_periods, is_fine, peak_after_s
+        one,
+        absorber_k,
+        gas_k,
+        target_k,
+        max_power_w,
+        period_s,
+        min_periods,
+        max_periods,
+        is_fine,
+        min_duty,
+        peak_after_s,
     )
 
 

@@ -1,10 +1,12 @@
 """Pulse that reaches a target displacement on the nominal pixel: the fewest PWM periods, tuned by duty or width."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import ceil
 
 import numpy as np
 
 from optodrive.core.kernels import kernel
+from optodrive.device.config import Config
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
 
@@ -14,20 +16,48 @@ class DriveRange:
 
     is_fine: pulses at full power that are longer than a period have any whole number of microseconds. The PWM does not
     switch at full power, so such a pulse has no phase.
+    min_duty: power of the weakest pulse over full power; at 1, pulses of any length have any number of microseconds
     """
 
     max_power_w: float
     period_s: float
     max_periods: int
     is_fine: bool = False
+    min_duty: float = 0.0
 
     @classmethod
-    def from_laser(
-        cls, max_power_w: float, pwm_hz: float, width_max_s: float, *, is_fine: bool = False
-    ) -> "DriveRange":
+    def from_laser(cls, max_power_w: float, pwm_hz: float, width_max_s: float) -> "DriveRange":
         """Return the range for a laser's power, W, and PWM frequency, Hz, and the longest pulse allowed, s."""
         # A width cap of whole periods must not lose one to rounding.
-        return cls(max_power_w, 1.0 / pwm_hz, int(width_max_s * pwm_hz + 1e-9), is_fine)
+        return cls(max_power_w, 1.0 / pwm_hz, int(width_max_s * pwm_hz + 1e-9))
+
+    @classmethod
+    def from_config(cls, config: Config) -> "DriveRange":
+        """Return the pulses that the only stage of a configuration may have. Those of a dimmed laser are whole periods.
+
+        A weakest pulse is stated where it is more than a step of the duty, which the board rounds.
+        """
+        laser, limits = config.laser, config.limits
+        drive = cls.from_laser(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s)
+        is_fine = laser.is_on_off or (not laser.whole_periods and limits.power_share == 1.0)
+        has_weakest = laser.is_on_off or laser.threshold_w > 0.0
+        min_duty = config.min_power_w / laser.max_power_w if has_weakest else 0.0
+        return replace(drive, is_fine=is_fine, min_duty=min_duty)
+
+    @property
+    def is_on_off(self) -> bool:
+        """Whether every pulse has full power."""
+        return self.min_duty >= 1.0
+
+    def build_pulse(self, energy_periods: float, min_periods: int = 1) -> tuple[float, float] | None:
+        """Return periods and duty of the shortest pulse with an energy, in periods at full power, None for none."""
+        if self.is_on_off:
+            width_us = round_us(energy_periods * self.period_s)
+            return (1e-6 * width_us / self.period_s, 1.0) if width_us > 0 else None
+        periods = max(min_periods, ceil(energy_periods))
+        duty = energy_periods / periods
+        pulse = choose_permitted(periods, duty, min_periods, self.min_duty) if duty > 0.0 else (0.0, 0.0)
+        return pulse if pulse[0] else None
 
 
 @kernel
@@ -72,13 +102,14 @@ def find_shortest_pulse(
     min_periods: int,
     max_periods: int,
     is_fine: bool,
+    min_duty: float,
     peak_after_s: float,
 ) -> tuple[float, float]:
     """Return PWM periods and duty of the shortest pulse whose peak gas rise is target_k, from the residual rises.
 
     The pulse has min_periods to max_periods, whole ones unless `DriveRange.is_fine`. peak_after_s: the peak counts only
     from this time after the pulse's start, and not before its end. Returns 0 periods if the residual heat already
-    reaches the target, and the longest pulse if none reaches it.
+    reaches the target, and the longest pulse if none reaches it; instead of a pulse weaker than min_duty, the nearest.
     """
     if _peak_after(pixel, theta_k, gamma_k, 0.0, 0.0, peak_after_s)[0] >= target_k:
         return 0.0, 0.0
@@ -90,7 +121,7 @@ def find_shortest_pulse(
             high = middle
         else:
             low = middle
-    if is_fine and high > min_periods:
+    if is_fine and (high > min_periods or min_duty >= 1.0):
         low_us, high_us = int(1e6 * low * period_s), round_us(high * period_s)
         while high_us - low_us > 1:
             middle_us = (low_us + high_us) // 2
@@ -102,7 +133,21 @@ def find_shortest_pulse(
         high_k = _peak_after(pixel, theta_k, gamma_k, max_power_w, high_us * 1e-6, peak_after_s)[0]
         return 1e-6 * (low_us if target_k - low_k < high_k - target_k else high_us) / period_s, 1.0
     duty = _solve_duty(pixel, theta_k, gamma_k, target_k, high * period_s, max_power_w, peak_after_s)
-    return (float(high), duty) if duty > MIN_DUTY else (0.0, 0.0)
+    return choose_permitted(high, duty, min_periods, min_duty) if duty > MIN_DUTY else (0.0, 0.0)
+
+
+@kernel
+def choose_permitted(periods: int, duty: float, min_periods: int, min_duty: float) -> tuple[float, float]:
+    """Return periods and duty of the pulse, or 0 periods for none, that has the nearest energy and emits.
+
+    A pulse of `periods` has at least min_duty, and a shorter one, of at least min_periods, full power.
+    """
+    if duty >= min_duty:
+        return float(periods), duty
+    shorter_duty = (periods - 1) / periods if periods > min_periods else 0.0
+    if min_duty - duty <= duty - shorter_duty:
+        return float(periods), min_duty
+    return (float(periods - 1), 1.0) if periods > min_periods else (0.0, 0.0)
 
 
 @kernel

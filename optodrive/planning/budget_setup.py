@@ -50,7 +50,6 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
         pulse_gap_s=limits.pulse_gap_min_s,
         pixel_window_s=limits.pixel_mean_window_s,
         display_window_s=limits.display_mean_window_s,
-        min_power_w=min(stage.min_power_w for stage in stages),
     )
     panel = build_nominal_panel(config, parameters, pixels)
     neighbours = Neighbours.from_display(config.display)
@@ -68,8 +67,10 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
     caps = caps._replace(absorber_k=caps.absorber_k - late_k)
     galvos = [build_galvo_model(stage) for stage in stages]
     check_galvo_cap(limits.galvo_acceleration_rms_max_rad_per_s2, galvos)
-    pwm_period_s = np.array([1.0 / stage.laser.pwm_hz for stage in stages])
-    return Budget(caps, heat, GalvoModels.from_models(*galvos), pwm_period_s)
+    pwm_period_s = np.array([1.0 / stage.laser.width_steps_hz for stage in stages])
+    min_power_w = np.array([stage.min_power_w for stage in stages])
+    is_proportional = np.array([not stage.laser.curve for stage in stages])
+    return Budget(caps, heat, GalvoModels.from_models(*galvos), pwm_period_s, min_power_w, is_proportional)
 
 
 def compute_fastest_rise_k_per_s(heat: HeatBound, caps: CapValues) -> float:

@@ -116,19 +116,12 @@ class DisplayModel:
         return StageAssignment(sequence, self.scan_heads, self.reach, self.pulse_widths)
 
 
-def build_drive(config: Config) -> DriveRange:
-    """Return the pulses that frames may have. Those of a dimmed laser are whole PWM periods."""
-    laser, limits = config.laser, config.limits
-    is_fine = not laser.whole_periods and limits.power_share == 1.0
-    return DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s, is_fine=is_fine)
-
-
 def build_scan_head(config: Config) -> ScanHead:
     """Build optics and mirrors of the only stage of a configuration."""
     return ScanHead(
         layout=build_aim_layout(config),
         field=load_scan_field(config),
         settling=build_settling_table(config),
-        drive=build_drive(config),
+        drive=DriveRange.from_config(config),
         pulse_gap_s=config.limits.pulse_gap_min_s,
     )

@@ -185,7 +185,6 @@ class SequencePlanner:
             early_step_s=1e-6 * self.display.scan_head.settling.early_us,
             heat=heat,
             budget=self._limiter.state,
-            threshold_w=np.array([laser.threshold_w for laser in self.display.config.lasers]),
             dead_pixels=self._dead_pixels,
         )
 

@@ -67,7 +67,6 @@ def summarize_plan(
         predicted_max_target_um=None if max_row is None else _finite_or_none(m_to_um(float(plan.target_m[max_row]))),
         target_max_um=m_to_um(float(target_m.max())) if len(plan) else 0.0,
         headroom_min_k=float(plan.headroom_k.min()),
-        below_threshold=planned.below_threshold,
         trimmed=_summarize_trimming(planned),
         shortfall=None if planned.shortfall is None else _summarize_shortfall(planned.shortfall),
         off_target=_summarize_train_peaks(planned),

@@ -81,7 +81,7 @@ class PlannedSequence:
     shortfall: under policy "trim", None if no pulse was trimmed; delays: under policy "delay"
     galvo_pause_s: total of the pauses in which the mirrors' coils cool
     early_step_s: time by which steps precede the end of the light on a pixel where the mirrors have come to rest
-    threshold_w: [s] of each stage's laser; dead_pixels: dead pixels that frames requested and that were omitted
+    dead_pixels: dead pixels that frames requested and that were omitted
     """
 
     sequence: FrameSequence
@@ -98,14 +98,7 @@ class PlannedSequence:
     early_step_s: float
     heat: ThermalState
     budget: BudgetState
-    threshold_w: FloatArray
     dead_pixels: tuple[int, ...] = ()
-
-    @property
-    def below_threshold(self) -> int:
-        """Number of pulses that are too weak for their stage's laser to emit."""
-        plan = self.plan
-        return int(np.count_nonzero((plan.power_w > 0.0) & (plan.power_w < self.threshold_w[plan.stage])))
 
     @property
     def stage_count(self) -> int:
@@ -133,11 +126,14 @@ def explain_nothing_raised(planned: PlannedSequence) -> str:
     """Say why a plan raises no pixel, or return an empty text if it raises one or the heat left in one does."""
     plan = planned.plan
     emitting = int(np.count_nonzero((plan.power_w > 0.0) & (plan.width_s > 0.0)))
-    # A skipped pixel is up already, by the heat that is left: that is what was requested.
-    if planned.skipped or emitting > planned.below_threshold:
-        return ""
     if emitting:
-        return "no pixel is raised: every pulse is weaker than laser.threshold_w"
+        return ""
+    if planned.skipped:
+        pixel, target_m = np.array([(pulse.pixel, pulse.target_m) for pulse in planned.skipped]).T
+        height_m = planned.heat.state_at(planned.duration_s).displacement_m[pixel.astype(np.int64)]
+        # A skipped pixel is up already, by the heat that is left, or the laser emits no pulse as weak as it needs.
+        is_up = bool((height_m > 0.5 * target_m).any())
+        return "" if is_up else "no pixel is raised: every pulse is weaker than laser.threshold_w"
     if len(plan):
         caps = ", ".join(sorted(set(plan.reason[plan.reason != ""].tolist())))
         return f"no pixel is raised: the caps leave no light ({caps})"

@@ -230,7 +230,6 @@ class PlanSummary(JsonModel):
     target_max_um: the largest target
     repeats: None if no frame repeats; redrawn: None but for a streamed frame with pixels that were drawn before
     beam_on_s: of all stages together; beam_on_fraction: of the time of all stages
-    below_threshold: pulses below laser.threshold_w, which emit nothing
     early_step_s: time by which steps precede the end of the light, 0 if they follow it
     pulses: number of pulses
     duration_s: from the plan's zero to the end of its last pulse, s
@@ -265,7 +264,6 @@ class PlanSummary(JsonModel):
     predicted_max_target_um: float | None
     target_max_um: float
     headroom_min_k: float
-    below_threshold: int
     trimmed: TrimmingSummary
     shortfall: ShortfallSummary | None
     off_target: OffTargetSummary

@@ -15,7 +15,7 @@ from optodrive.planning.limiter.panel_bound import (
     Uncertainty,
 )
 from optodrive.planning.limiter.worst_case import build_heat_bound
-from reference_models.thermal_display import NO_CAPS, TOUCHED, build_plan, build_true_display
+from reference_models.thermal_display import NO_CAPS, TOUCHED, build_lasers, build_plan, build_true_display
 
 FULL_W = 2.45
 SECTION = DisplaySection(rows=2, columns=2, pitch_m=4e-3, bridge_width_m=4e-4)
@@ -57,7 +57,7 @@ SCENARIOS = {
 def limit_scenario(scenario, **half_widths):
     caps, rows = SCENARIOS[scenario]
     unsure, caps = Uncertainty(**dict.fromkeys(HALF_WIDTHS, 0.0) | half_widths), NO_CAPS._replace(**caps)
-    budget = Budget(caps, build_heat_bound(MODEL, unsure, caps, FULL_W), MIRRORS, np.full(1, 2e-4))
+    budget = Budget(caps, build_heat_bound(MODEL, unsure, caps, FULL_W), MIRRORS, *build_lasers(2e-4))
     return limit(build_plan(rows, FULL_W, SECTION), build_cold_budget_state(4), budget)[0]
 
 

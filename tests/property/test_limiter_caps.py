@@ -16,6 +16,7 @@ from reference_models.thermal_display import (
     KINDS,
     NO_CAPS,
     TOUCHED,
+    build_lasers,
     build_long_sequence,
     build_plan,
     build_sequence,
@@ -63,7 +64,7 @@ def random_mirrors(rng):
 def build_budget(model, unsure, caps, mirrors, skew_s=0.0):
     """Return the budget of as many stages as there are mirrors."""
     heat = build_heat_bound(model, unsure, caps, *[FULL_W] * len(mirrors), skew_s=skew_s)
-    return Budget(caps, heat, GalvoModels.from_models(*mirrors), np.full(len(mirrors), 1e-6))
+    return Budget(caps, heat, GalvoModels.from_models(*mirrors), *build_lasers(1e-6, len(mirrors)))
 
 
 def limit_in_batches(rng, plan, budget, pixels):

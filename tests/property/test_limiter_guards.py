@@ -17,6 +17,7 @@ from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import (
     NO_CAPS,
     TOUCHED,
+    build_lasers,
     build_plan,
     build_true_display,
     galvo_peak,
@@ -71,7 +72,7 @@ def build_budget(guard, panel=None):
     display = DISPLAYS[name]
     unsure, power_max_w = get_uncertainty(name), display.config.laser.max_power_w
     heat = build_heat_bound(build_model(name, panel or own), unsure, display.budget.caps, power_max_w)
-    return Budget(NO_CAPS._replace(**binding), heat, display.budget.galvos, display.budget.pwm_period_s)
+    return Budget(NO_CAPS._replace(**binding), heat, *display.budget[2:])
 
 
 def get_uncertainty(name):
@@ -164,7 +165,7 @@ def wrong_constant(guard):
             caps = caps._replace(display_window_s=2.0 * caps.display_window_s)
         else:
             galvos = galvos._replace(omega_rad_per_s=0.8 * galvos.omega_rad_per_s)
-        return Budget(caps, heat, galvos, np.full(1, 1e-6))
+        return Budget(caps, heat, galvos, *build_lasers(1e-6))
 
     return dict(mutate=mutate)
 
@@ -222,9 +223,7 @@ def test_walls_and_panel_have_the_touch_cap_without_a_touch_surface(node):
         caps = NO_CAPS._replace(touch_k=touch_k)
         heat = build_heat_bound(model, get_uncertainty("display-16"), caps, 2.45)
         plan = build_plan(visit_all_pixels(60.0), 2.45, display.config.display)
-        limited, _ = limit(
-            plan, build_cold_budget_state(16), Budget(caps, heat, display.budget.galvos, display.budget.pwm_period_s)
-        )
+        limited, _ = limit(plan, build_cold_budget_state(16), Budget(caps, heat, *display.budget[2:]))
         peaks = build_true_display(model, worst_factors("panel")).peaks(limited)
         fractions.append(max(peaks[row] for row in TOUCHED) / 15.0)
     assert 0.9 <= fractions[0] <= 1 + 1e-9

@@ -15,7 +15,7 @@ from optodrive.planning.limiter.heat_bound import panel_rise_by_others_k
 from optodrive.planning.limiter.limiter import build_cold_budget_state, concatenate, limit
 from optodrive.planning.limiter.panel_bound import NominalPanel, NominalThermalModel, NominalWalls, Uncertainty
 from optodrive.planning.limiter.worst_case import build_heat_bound
-from reference_models.thermal_display import NO_CAPS, build_plan, build_true_display
+from reference_models.thermal_display import NO_CAPS, build_lasers, build_plan, build_true_display
 
 FULL_W = 2.45
 SECTION = DisplaySection(rows=2, columns=2, pitch_m=4e-3, bridge_width_m=4e-4)
@@ -53,7 +53,7 @@ def build_budget(name):
     model, cap_k, _ = CASES[name]
     caps = NO_CAPS._replace(wall_k=cap_k)
     heat = build_heat_bound(model, CERTAIN, caps, *[FULL_W] * STAGES)
-    return Budget(caps, heat, GalvoModels.from_models(*[FAST_MIRRORS] * STAGES), np.full(STAGES, 1e-6))
+    return Budget(caps, heat, GalvoModels.from_models(*[FAST_MIRRORS] * STAGES), *build_lasers(1e-6, STAGES))
 
 
 def build_drive(name):

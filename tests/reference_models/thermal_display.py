@@ -26,9 +26,15 @@ NO_CAPS = CapValues(
     **dict.fromkeys(CapValues._fields, inf)
     | {"absorber_k": 1e3, "wall_k": 500.0, "touch_k": 500.0, "pulse_energy_j": 1e3, "pulse_width_s": 0.050}
     | {"pulse_gap_s": 5e-4, "pixel_mean_w": 1e3, "pixel_window_s": 1.0, "display_mean_w": 1e3, "display_window_s": 2.0}
-    | {"min_power_w": 0.0}
 )
 """Caps that do not bind."""
+
+
+def build_lasers(pwm_period_s, count=1):
+    """Return the last fields of a `Budget`: of lasers in proportion, without a weakest pulse."""
+    return np.full(count, pwm_period_s), np.zeros(count), np.full(count, True)
+
+
 SETTLED_AFTER_S = 1.8
 """Time after a pulse, s, after which absorbers and gas have settled to their walls: over twenty time constants."""
 

@@ -169,6 +169,8 @@ class Dimmer:
         configured = self._full.budget.caps.power_share
         if not 0.0 <= share <= configured:
             raise InputError("share", share, f"a number from 0 to {configured:g}, limits.power_share as configured")
+        if 0.0 < share < 1.0 and any(laser.is_on_off for laser in self._full.config.lasers):
+            raise InputError("share", share, "0 or 1: with laser.modulation 'on_off' a pulse has full power")
         self._memory.power_share = share
         self._build_display()
 

@@ -16,6 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from optodrive.core.errors import InputError, refuse_os_error
+from optodrive.core.laser_power import ROUNDING
 from optodrive.core.types.arrays import BoolArray
 from optodrive.core.types.measurements import Measurement, Run
 from optodrive.core.types.stimuli import PulseTrain
@@ -73,11 +74,18 @@ def compute_pulse(config: Config, aim: Aim) -> tuple[float, float]:
     laser, limits = config.laser, config.limits
     if aim.x_m == aim.y_m == 0.0:
         energy_j = ENERGY_FRACTION * limits.pulse_energy_max_j
-        periods = max(1, int(energy_j / laser.max_power_w * laser.pwm_hz))
-        width_s = min(periods / laser.pwm_hz, limits.pulse_width_max_s)
-        return width_s, min(laser.max_power_w, energy_j / width_s)
-    width_s = int(limits.pulse_width_max_s * laser.pwm_hz + 1e-6) / laser.pwm_hz
-    return width_s, edge_power_max_w(config, width_s)
+        steps = max(1, int(energy_j / laser.max_power_w * laser.width_steps_hz))
+        width_s = min(steps / laser.width_steps_hz, limits.pulse_width_max_s)
+        return width_s, max(config.min_power_w, min(laser.max_power_w, energy_j / width_s))
+    steps = int(limits.pulse_width_max_s * laser.width_steps_hz + 1e-6)
+    while steps > 1 and edge_power_max_w(config, steps / laser.width_steps_hz) < config.min_power_w:
+        steps = int(0.99 * steps)
+    width_s = steps / laser.width_steps_hz
+    max_w = edge_power_max_w(config, width_s)
+    if max_w < config.min_power_w * (1.0 - ROUNDING):
+        expected = f"at most {max_w:.3g} W across the edge of an absorber, where the light falls on walls"
+        raise InputError("laser.threshold_w", laser.threshold_w, expected)
+    return width_s, max(config.min_power_w, max_w)
 
 
 def edge_power_max_w(config: Config, width_s: float) -> float:
@@ -91,7 +99,7 @@ def edge_power_max_w(config: Config, width_s: float) -> float:
     area_m2 = laser.focus_width_m * laser.focus_height_m
     rise_k_per_w_s05 = 2.0 / (ACRYLIC_EFFUSIVITY_W_S05_PER_M2_K * np.pi**0.5 * area_m2)
     mean = rise_k_per_w_s05 * width_s**0.5
-    ripple = rise_k_per_w_s05 * (laser.max_power_w / laser.pwm_hz) ** 0.5
+    ripple = rise_k_per_w_s05 * (laser.max_power_w / laser.width_steps_hz) ** 0.5
     root = (-ripple + np.sqrt(ripple**2 + 4.0 * mean * headroom_k)) / (2.0 * mean)
     energy_w = ENERGY_FRACTION * limits.pulse_energy_max_j / width_s
     return float(min(root**2, energy_w, laser.max_power_w))

@@ -11,7 +11,7 @@ display's record states, and the record gets what is left of it at the end.
 import sys
 from collections.abc import Callable
 from math import ceil, inf, pi
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.link.board_setup import build_bench_requirements
-from optodrive.link.protocol.quantisation import CENTRE_CODE, DUTY_MAX, WirePoints, decode, quantise
+from optodrive.link.protocol.quantisation import CENTRE_CODE, WirePoints, decode, quantise
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.board_view import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob
@@ -196,9 +196,31 @@ def max_settling_s(config: Config) -> float:
 
 def spot_width_s(config: Config) -> float:
     """Return the width of a spot's pulse, s: whole PWM periods within the configured maximum."""
-    pwm_hz = config.laser.pwm_hz
-    periods = max(1, int(min(SPOT_WIDTH_S, config.limits.pulse_width_max_s) * pwm_hz * (1 + 1e-9)))
-    return round(periods / pwm_hz * 1e6) * 1e-6
+    return _round_width_s(config, min(SPOT_WIDTH_S, config.limits.pulse_width_max_s))
+
+
+def _round_width_s(config: Config, width_s: float) -> float:
+    """Return the next smaller width of a pulse, s, but at least one step."""
+    steps_hz = config.laser.width_steps_hz
+    return round(max(1, int(width_s * steps_hz * (1 + 1e-9))) / steps_hz * 1e6) * 1e-6
+
+
+class Spot(NamedTuple):
+    """The pulse of a spot: power, W, and width, s."""
+
+    power_w: float
+    width_s: float
+
+
+def build_spot(config: Config, power_w: float) -> Spot:
+    """Return the spot of a power, W.
+
+    A laser that emits no power as weak as this gets the energy by a shorter pulse of its weakest.
+    """
+    width_s, weakest_w = spot_width_s(config), config.min_power_w
+    if power_w >= weakest_w:
+        return Spot(power_w, width_s)
+    return Spot(weakest_w, _round_width_s(config, power_w / weakest_w * width_s))
 
 
 def max_spot_power_w(config: Config) -> float:
@@ -208,9 +230,10 @@ def max_spot_power_w(config: Config) -> float:
 
 def check_spot_power(config: Config, power_w: float, option: str = "--spot-power-mw") -> None:
     """Raise InputError, naming the option, for a power outside the range of a spot."""
-    max_w, threshold_w = max_spot_power_w(config), config.laser.threshold_w
-    if 0.0 < power_w < threshold_w:
-        expected = f"at least laser.threshold_w, {format_number(threshold_w * 1e3)} mW, below which nothing is emitted"
+    max_w = max_spot_power_w(config)
+    shortest_w = config.min_power_w / config.laser.width_steps_hz / spot_width_s(config)
+    if 0.0 < power_w < shortest_w:
+        expected = f"at least {format_number(shortest_w * 1e3)} mW, that of the laser's weakest and shortest pulse"
         raise InputError(option, Unquoted(f"{power_w * 1e3:g} mW"), expected)
     if not 0.0 < power_w <= max_w:
         raise InputError(
@@ -242,7 +265,7 @@ class ExclusiveBoard(ArmedBoard):
         self._record: HeatRecord | None = None
         self._is_interrupted, self._is_known = False, True
         self._accounted_pixel = find_weakest_pixel(display)
-        self._settling_s, self._width_s = max_settling_s(config), spot_width_s(config)
+        self._settling_s = max_settling_s(config)
         # The mirrors leave for a single point when it begins, which is earlier than the lead-in of a plan.
         leaving_s = np.full_like(display.budget.galvos.lead_in_s, self._settling_s)
         self._point_budget = display.budget._replace(galvos=display.budget.galvos._replace(lead_in_s=leaving_s))
@@ -254,7 +277,7 @@ class ExclusiveBoard(ArmedBoard):
 
     def connect(self) -> None:
         """Load the kernels first, because compilation would delay the lease, then connect."""
-        limit(self._plan(0.0, 0.0, self.zero_duty_power_w), self._state, self.display.budget)
+        limit(self._plan(0.0, 0.0, self._gate_off), self._state, self.display.budget)
         super().connect()
         if self._record is None:
             self._recall_heat()
@@ -296,12 +319,12 @@ class ExclusiveBoard(ArmedBoard):
 
     def move_to(self, x_code: int, y_code: int) -> None:
         """Move the mirrors with the gate off and wait until they have settled."""
-        self._execute_point(x_code, y_code, self.zero_duty_power_w, gate_on=False)
+        self._execute_point(x_code, y_code, self._gate_off, gate_on=False)
 
     def fire_spot(self, x_code: int, y_code: int, power_w: float) -> None:
         """Emit one short pulse with settled mirrors and wait until the board has reported it in full."""
         check_spot_power(self.config, power_w)
-        self._execute_point(x_code, y_code, power_w, gate_on=True)
+        self._execute_point(x_code, y_code, build_spot(self.config, power_w), gate_on=True)
 
     def play(self, plan: PulsePlan, on_reported: Callable[[PlanJob], None]) -> None:
         """Play a plan once it fits all caps without trimming, and wait until the board has reported it in full.
@@ -329,16 +352,20 @@ class ExclusiveBoard(ArmedBoard):
     @property
     def zero_duty_power_w(self) -> float:
         """Power that rounds to duty 0: the gate stays off, while the limiter still counts the move."""
-        return 0.5 * self.config.laser.max_power_w / DUTY_MAX
+        return 0.5 * self.config.min_power_w
 
-    def _plan(self, x_rad: float, y_rad: float, power_w: float) -> PulsePlan:
+    @property
+    def _gate_off(self) -> Spot:
+        return Spot(self.zero_duty_power_w, spot_width_s(self.config))
+
+    def _plan(self, x_rad: float, y_rad: float, spot: Spot) -> PulsePlan:
         """Build a plan of one pulse, accounted to the weakest pixel because the pixel it hits is unknown."""
         return PulsePlan(
             start_s=np.array([self._settling_s]),
-            width_s=np.array([self._width_s]),
+            width_s=np.array([spot.width_s]),
             x_rad=np.array([x_rad]),
             y_rad=np.array([y_rad]),
-            power_w=np.array([power_w]),
+            power_w=np.array([spot.power_w]),
             pixel=np.array([self._accounted_pixel]),
             settling_s=np.array([self._settling_s]),
             target_m=np.array([np.nan]),
@@ -347,10 +374,10 @@ class ExclusiveBoard(ArmedBoard):
             stage=np.array([0]),
         )
 
-    def _execute_point(self, x_code: int, y_code: int, power_w: float, gate_on: bool) -> None:
+    def _execute_point(self, x_code: int, y_code: int, spot: Spot, gate_on: bool) -> None:
         self.check_range(x_code, y_code)
         x_rad, y_rad = self.session.scale.to_angles_rad(np.array([x_code, y_code]))
-        self._emit(self._plan(x_rad, y_rad, power_w), self._point_budget, gate_on)
+        self._emit(self._plan(x_rad, y_rad, spot), self._point_budget, gate_on)
 
     def check_range(self, x_code: int, y_code: int) -> None:
         """Raise InputError for codes beyond the display and its margin."""
@@ -432,7 +459,7 @@ class ExclusiveBoard(ArmedBoard):
         limited, points, start_s = self._account(plan, budget, len(plan) if gate_on else 0)
         self._is_interrupted = True  # until its delay is accounted for
         job = self._run_job(points, start_s, on_reported)
-        executed = job.build_executed(limited, self.session.scale.full_power_w, self.session.scale.tick_s)
+        executed = job.build_executed(limited, self.session.scale)
         if gate_on and not np.allclose(executed.width_s, limited.width_s):
             self._is_known = False
             raise BoardFaultError(

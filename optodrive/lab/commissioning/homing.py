@@ -266,9 +266,7 @@ STEPS: tuple[Step, ...] = (
 
 def default_power_w(config: Config) -> float:
     """Return the lowest power that is emitted and that the reference board's readback detects, at most a spot's, W."""
-    # Below its threshold a laser emits nothing, and a step would pass that has shown nothing.
-    lowest_w = max(DUTY_SHARE * config.laser.max_power_w, config.laser.threshold_w)
-    return min(lowest_w, max_spot_power_w(config))
+    return min(DUTY_SHARE * config.laser.max_power_w, max_spot_power_w(config))
 
 
 def emit_first_light(

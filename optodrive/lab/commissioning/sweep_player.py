@@ -9,6 +9,7 @@ from optodrive.core.types.plans import LimitedPlan, PulsePlan
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.lab.calibration.pixel_sweep import Aim, SweepJournal, SweepPulse, build_sweep, is_reachable
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
+from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
@@ -109,9 +110,13 @@ class _JournalRecorder:
                     round(unix_minus_board_s + on_tick * scale.tick_s, 6),
                     round(on_tick * scale.tick_s, 6),
                     round(on_ticks * scale.tick_s, 6),
-                    round(duty / 65535.0 * scale.full_power_w, 9),
+                    round(power_w, 9),
                 )
-                for row, on_tick, on_ticks, duty, _ in zip(*(column.tolist() for column in reported), strict=True)
+                for row, on_tick, on_ticks, power_w in zip(
+                    *(column.tolist() for column in reported[:3]),
+                    scale.to_power_w(reported.duty / DUTY_MAX).tolist(),
+                    strict=True,
+                )
             ]
         )
         self.count = self.first + done

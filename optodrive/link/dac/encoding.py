@@ -32,7 +32,6 @@ class PointScale(DacScale, bits=12):
     early_points: points by which the mirrors leave before the end of a pulse, after early_dwell_us on its pixel
     """
 
-    full_power_w: float
     format: DacFormat
     early_points: int = 0
     early_dwell_us: int = 0
@@ -43,8 +42,16 @@ class PointScale(DacScale, bits=12):
         rad_per_code = config.scanner.range_rad / DAC_HALF_RANGE_CODES
         dac_format = find_format(config.board.transport)(config.board.points_per_s)
         settling = build_settling_table(config)
-        early = settling.early_points, settling.early_dwell_us
-        return cls(rad_per_code, config.laser.max_power_w, dac_format, *early, **config.scanner.wiring._asdict())
+        return cls(
+            rad_per_code,
+            config.laser.max_power_w,
+            dac_format,
+            settling.early_points,
+            settling.early_dwell_us,
+            curve=config.laser.curve,
+            min_power_w=config.min_power_w,
+            **config.scanner.wiring._asdict(),
+        )
 
     @property
     def point_s(self) -> float:
@@ -98,7 +105,8 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     share = plan.power_w / scale.full_power_w
     if len(plan) and not 0 <= share.min() <= share.max() <= 1 + 1e-12:
         raise LocalProtocolError(f"powers of {share.min():g} to {share.max():g} leave the range 0 to 1 of the laser's")
-    level = np.floor(share / scale.format.stretch * level_max * (1 + 1e-12)).astype(np.int64)
+    duty = np.where(scale.to_duty(plan.power_w) > 0.0, scale.to_duty(plan.power_w / scale.format.stretch), 0.0)
+    level = np.floor(duty * level_max * (1 + 1e-12)).astype(np.int64)
     first, last = -(-start // ticks) + scale.format.settling_points, end // ticks
     last[:-1] -= last[:-1] == first[1:]  # a blank point separates adjacent pulses
     emitting = (level > 0) & (last > first)  # the mirrors skip pulses without emission
@@ -193,7 +201,7 @@ def decode(chunks: Sequence[bytes], scale: PointScale) -> PointPulses:
         width_s=(begin_ticks[run_ends] - begin_ticks[run_starts]) / scale.format.clock_hz,
         x_rad=scale.to_angles_rad(x),
         y_rad=scale.to_angles_rad(y),
-        power_w=level / scale.format.level_max * scale.full_power_w * scale.format.stretch,
+        power_w=scale.to_power_w(level / scale.format.level_max) * scale.format.stretch,
     )
 
 

@@ -10,6 +10,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError
+from optodrive.core.laser_power import ROUNDING, Curve, compute_duty, compute_power_w
 from optodrive.core.types.arrays import FloatArray, IntArray, ReadOnlyArrays
 from optodrive.core.types.plans import LimitedPlan
 
@@ -19,12 +20,16 @@ class DacScale:
     """Scale of a digital-to-analogue converter of the mirrors.
 
     CODE_MAX: largest code; CENTRE_CODE: that of angle 0
+    full_power_w, curve: power at full duty and, unless in proportion, at other duties; min_power_w: of a pulse
     swap_axes: output X has the mirror that moves the beam along y; invert_x, invert_y: outputs whose sign is turned
     """
 
     CODE_MAX: ClassVar[int]
     CENTRE_CODE: ClassVar[int]
     rad_per_code: float
+    full_power_w: float
+    curve: Curve = field(default=(), kw_only=True)
+    min_power_w: float = field(default=0.0, kw_only=True)
     swap_axes: bool = field(default=False, kw_only=True)
     invert_x: bool = field(default=False, kw_only=True)
     invert_y: bool = field(default=False, kw_only=True)
@@ -42,6 +47,15 @@ class DacScale:
     def to_angles_rad(self, codes: IntArray) -> FloatArray:
         """Return the mirror angles of codes, rad, any shape."""
         return np.asarray((codes - self.CENTRE_CODE) * self.rad_per_code, dtype=np.float64)
+
+    def to_duty(self, power_w: FloatArray) -> FloatArray:
+        """Return the duties of mean powers, W, any shape: 0 for less than the weakest pulse."""
+        duty = compute_duty(power_w, self.full_power_w, self.curve)
+        return np.where(power_w < self.min_power_w * (1.0 - ROUNDING), np.minimum(duty, 0.0), duty)
+
+    def to_power_w(self, duty: FloatArray) -> FloatArray:
+        """Return the mean powers of duties, any shape, W."""
+        return compute_power_w(duty, self.full_power_w, self.curve)
 
     def to_outputs(self, x_codes: IntArray, y_codes: IntArray) -> tuple[IntArray, IntArray]:
         """Return the codes of the outputs X and Y for codes along x and y, any shape.
@@ -78,7 +92,6 @@ GATE_OFF_STEP_TICKS = 60_000
 class WireScale(DacScale, bits=16):
     """Scale factors between SI units and wire integers."""
 
-    full_power_w: float
     tick_s: float
 
 
@@ -166,7 +179,7 @@ def quantise(plan: LimitedPlan, scale: WireScale, stage: int = 0) -> WirePoints:
     start = np.rint(plan.start_s[rows] / scale.tick_s).astype(np.int64)
     width = np.rint(plan.width_s[rows] / scale.tick_s).astype(np.int64)
     # Down, so that no point has more light than was limited; the 1e-12 keeps whole duties whole against rounding.
-    duty = np.floor(plan.power_w[rows] / scale.full_power_w * DUTY_MAX * (1 + 1e-12)).astype(np.int64)
+    duty = np.floor(scale.to_duty(plan.power_w[rows]) * DUTY_MAX * (1 + 1e-12)).astype(np.int64)
     misfits = np.flatnonzero((width > TICKS_MAX) | (width < 1) | (duty > DUTY_MAX) | (duty < 0))
     if len(misfits):
         first = rows[misfits[0]]
@@ -218,5 +231,5 @@ def decode(payload: bytes, scale: WireScale) -> DecodedPulses:
         width_s=np.asarray(on[gate_on] * scale.tick_s, dtype=np.float64),
         x_rad=scale.to_angles_rad(x[gate_on]),
         y_rad=scale.to_angles_rad(y[gate_on]),
-        power_w=duty[gate_on] / DUTY_MAX * scale.full_power_w,
+        power_w=scale.to_power_w(duty[gate_on] / DUTY_MAX),
     )

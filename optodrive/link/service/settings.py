@@ -25,10 +25,10 @@ class BoardSettings:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
         """Return the settings whose fields asdict() wrote."""
-        requirements = values["requirements"]
+        requirements, scale = values["requirements"], values["requirements"]["scale"]
         requirements |= {
             "limits": m.Limits(**requirements["limits"]),
-            "scale": WireScale(**requirements["scale"]),
+            "scale": WireScale(**scale | {"curve": tuple(map(tuple, scale["curve"]))}),
             "values": ConfiguredValues(**requirements["values"]),
         }
         return cls(PortSettings(**values["port"]), BoardRequirements(**requirements), values["stage"])

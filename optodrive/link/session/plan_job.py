@@ -9,7 +9,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses, PulsePlan
 from optodrive.link.protocol.messages import Executed
-from optodrive.link.protocol.quantisation import TICKS_MAX, WirePoints
+from optodrive.link.protocol.quantisation import DUTY_MAX, TICKS_MAX, WirePoints, WireScale
 
 RETIMING_RATE_MAX = 2e-4
 """Largest relative shift of points by which a job follows the host's clock, that of two crystals."""
@@ -310,20 +310,20 @@ class PlanJob:
         """Whether every point was sent and reported as executed."""
         return self.is_fully_sent and self.first_unreported is None
 
-    def build_executed(self, plan: PulsePlan, full_power_w: float, tick_s: float) -> ExecutedPulses:
+    def build_executed(self, plan: PulsePlan, scale: WireScale) -> ExecutedPulses:
         """Return the reported pulses of `plan`. They are complete if none is missing from the untruncated part."""
         done = self._pulse_points[self._on_tick[self._pulse_points] >= 0]
         row = self.list_executed_rows()
         width_ticks = self._on_ticks[done]
-        planned_tick = self.start_tick + plan.start_s[row] / tick_s
+        planned_tick = self.start_tick + plan.start_s[row] / scale.tick_s
         on_tick = find_begin_tick(self._on_tick[done], width_ticks, self._find_late_ticks(done), planned_tick)
         return ExecutedPulses(
             on_tick=on_tick,
             width_ticks=width_ticks,
             pixel=plan.pixel[row],
-            power_w=self._duty[done] / 65535.0 * full_power_w,
-            start_s=np.asarray((on_tick - self.start_tick) * tick_s, dtype=np.float64),
-            width_s=np.asarray(width_ticks * tick_s, dtype=np.float64),
+            power_w=scale.to_power_w(self._duty[done] / DUTY_MAX),
+            start_s=np.asarray((on_tick - self.start_tick) * scale.tick_s, dtype=np.float64),
+            width_s=np.asarray(width_ticks * scale.tick_s, dtype=np.float64),
             stage=np.zeros(len(row), dtype=np.int64),
             complete=self.is_complete,
         )

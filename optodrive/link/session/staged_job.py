@@ -109,13 +109,12 @@ class StagedJob:
         """
         stage, pulse = self._stage[begin:end], self._pulse[begin:end]
         row, on_tick, on_ticks, duty, late = (np.zeros(len(stage), dtype=np.int64) for _ in range(5))
-        full_power_w = np.zeros(len(stage))
+        power_w = np.zeros(len(stage))
         for number, (part, scale) in enumerate(zip(self.parts, scales, strict=True)):
             mine = stage == number
             row[mine], on_tick[mine], on_ticks[mine], duty[mine], late[mine] = part.read_reports(pulse[mine])
-            full_power_w[mine] = scale.full_power_w
+            power_w[mine] = scale.to_power_w(duty[mine] / DUTY_MAX)
         done = on_tick >= 0
-        power_w = np.asarray(duty / DUTY_MAX * full_power_w, dtype=np.float64)
         return StageReports(row[done], on_tick[done], on_ticks[done], power_w[done], stage[done], late[done])
 
     def find_begin_tick(self, reported: StageReports, plan: PulsePlan, tick_s: float) -> IntArray:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optodrive.core.laser_power import compute_power_w
 from optodrive.core.quantity import ZERO_CELSIUS_K, m_to_um
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, PixelTrace, Run, Signal
@@ -272,6 +273,7 @@ class SimulatedOptics:
             if cold_state is None
             else SimulatedPixelRecorder(config, truth, self.galvos, cold_state, recorder_seed)
         )
+        self._curve = config.laser.curve
         self._full_w = settings.limits.full_power_uw * 1e-6
         self._link = link
         self._buffer = b""
@@ -281,7 +283,7 @@ class SimulatedOptics:
         """Apply an event of the board's log."""
         if event["event"] == "pulse":
             width_s = (event["off_us"] - event["on_us"]) * 1e-6
-            power_w = event["duty"] / 65535 * self._full_w
+            power_w = float(compute_power_w(np.array(event["duty"] / 65535), self._full_w, self._curve))
             self._sensor.record_pulse(event["on_us"], event["off_us"], power_w * width_s)
             if self._recorder is not None:
                 self._recorder.record_pulse(event["on_us"], event["off_us"], power_w)

@@ -9,7 +9,7 @@ from math import ceil, sqrt
 from optodrive.core.errors import OverBudgetError, RefusedError
 from optodrive.core.types.plans import BudgetState
 from optodrive.core.types.push_options import FitMode, Policy
-from optodrive.core.types.stimuli import FrameSequence
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.order_search import ORDERS_MAX, Orders, OrderSearch, count_orders
@@ -37,7 +37,10 @@ def find_height_factor(search: OrderSearch, sequence: FrameSequence) -> tuple[fl
     Returns the factor and the visiting orders, or None if no factor fits.
     """
     best: tuple[float, Orders] | None = None
-    low, high = 0, 100
+    weakest_w = max(stage.min_power_w for stage in search.display.config.list_stage_configs())
+    powers_w = [train.power_w for train in sequence.trains if isinstance(train, PulseTrain)]
+    # A factor that makes a pulse weaker than its laser emits would leave the train dark.
+    low, high = max((ceil(100.0 * weakest_w / power_w) for power_w in powers_w), default=1) - 1, 100
     while high - low > 1:
         middle = (low + high) // 2
         orders = search.find_orders(scale_sequence(sequence, middle / 100))

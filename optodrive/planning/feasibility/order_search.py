@@ -65,7 +65,7 @@ class OrderSearch:
         self.plans_max = plans_max
         self.is_exhausted = False
         self.stage_count = len(display.scan_heads)
-        self._display = display
+        self.display = display
         self._heat = heat
         self._budget = budget
         self.on_progress = on_progress
@@ -113,7 +113,7 @@ class OrderSearch:
 
         None means that a target is unreachable, that a height train has no such cycle, or that the search is exhausted.
         """
-        if first_unreachable(self._display, sequence) is not None:
+        if first_unreachable(self.display, sequence) is not None:
             return None
         if self.plans_tried >= self.plans_max:
             self.is_exhausted = True
@@ -122,7 +122,7 @@ class OrderSearch:
         self.plans_tried += 1
         try:
             return plan_sequence(
-                self._display, sequence, self._heat, self._budget, "trim", lambda _share: self.on_progress()
+                self.display, sequence, self._heat, self._budget, "trim", lambda _share: self.on_progress()
             )
         except InputError:  # no steady cycle of a height train has this height and period
             return None
@@ -135,8 +135,8 @@ class OrderSearch:
         if violation.reason != "deadline" or violation.source >= len(sequence.frames):
             return False, None
         frame = sequence.frames[violation.source]
-        lead_in_s = max(head.settling.lead_in_us for head in self._display.scan_heads) * 1e-6
-        lower_bound_s = beam_lower_bound_s(self._display, sequence, self._heat, violation.source, lead_in_s)
+        lead_in_s = max(head.settling.lead_in_us for head in self.display.scan_heads) * 1e-6
+        lower_bound_s = beam_lower_bound_s(self.display, sequence, self._heat, violation.source, lead_in_s)
         # Pulses start on whole microseconds; a deadline need not lie on one.
         return (
             lower_bound_s is not None and lower_bound_s > frame.duration_s + MICROSECOND_S + TIME_TOLERANCE_S,
@@ -145,7 +145,7 @@ class OrderSearch:
 
     def _try_orders(self, sequence: FrameSequence, orders: Orders | None = None) -> Violation | None:
         """Return the first violation of the plan in the given orders, or in the planner's own if None."""
-        unreachable = first_unreachable(self._display, sequence) if orders is None else None
+        unreachable = first_unreachable(self.display, sequence) if orders is None else None
         if unreachable is not None:
             return Violation("unreachable", unreachable[0], unreachable[1])
         if self.plans_tried >= self.plans_max:
@@ -165,14 +165,14 @@ class OrderSearch:
     ) -> Violation | None:
         """Plan batch by batch up to the first violation, with or without the limiter."""
         scheduler = Scheduler(
-            self._display.scan_heads,
-            self._display.build_assignment(sequence),
+            self.display.scan_heads,
+            self.display.build_assignment(sequence),
             sequence,
-            self._display.build_cold_heat,
+            self.display.build_cold_heat,
             on_progress=self.on_progress,
             visiting_orders=orders,
         )
-        limiter = BatchLimiter(scheduler, self._display.budget, self._budget, len(sequence.frames))
+        limiter = BatchLimiter(scheduler, self.display.budget, self._budget, len(sequence.frames))
         deadline_s = deadlines_s(sequence, scheduler.lead_in_us * 1e-6)
 
         def grant(batch: PulsePlan) -> PulsePlan | None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.kernels import kernel
-from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.planning.limiter.caps import CapValues
 
 TOLERANCE = 1e-9
@@ -149,10 +149,13 @@ def select_galvo(galvos: GalvoModels, stage: int) -> GalvoModel:
 class Budget(NamedTuple):
     """All coefficients that the limiter needs.
 
-    pwm_period_s: [k] period of each stage's laser
+    pwm_period_s, min_power_w: [k] period of each stage's laser, and power of its weakest pulse; weaker ones are dark
+    is_proportional: [k] whether a laser emits its full power for its duty of each period, and nothing for the rest
     """
 
     caps: CapValues
     heat: HeatBound
     galvos: GalvoModels
     pwm_period_s: FloatArray
+    min_power_w: FloatArray
+    is_proportional: BoolArray

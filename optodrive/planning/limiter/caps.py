@@ -175,7 +175,6 @@ class CapValues(NamedTuple):
     pulse_gap_s: gate-off time after which pulses on a pixel count separately
     pixel_window_s, display_window_s: lengths of the windows over which mean powers are taken
     power_share: largest power of a pulse as a share of the laser's
-    min_power_w: smallest power that the board can emit; weaker pulses count as zero
     """
 
     power_share: float
@@ -190,4 +189,3 @@ class CapValues(NamedTuple):
     pixel_window_s: float
     display_mean_w: float
     display_window_s: float
-    min_power_w: float

@@ -17,7 +17,7 @@ from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import EMPTY_PLAN, BudgetState, LimitedPlan, PulsePlan
 from optodrive.core.types.push_options import Policy
-from optodrive.planning.limiter.budget import Budget
+from optodrive.planning.limiter.budget import TOLERANCE, Budget
 from optodrive.planning.limiter.caps import CAPS_BY_KEY, REASONS, WRONG_ORDER
 from optodrive.planning.limiter.galvo_load import count_galvo_feasible
 from optodrive.planning.limiter.pulse_application import (
@@ -149,7 +149,9 @@ def limit(
     )
     if applied < len(plan):
         raise _build_refusal(plan, applied, float(power_w[applied]), REASONS[cause[applied]], state, budget)
-    power_w = np.where(power_w < plan.power_w, _allow_for_split_period(plan, power_w, budget), power_w)
+    split_w = _allow_for_split_period(plan, power_w, budget)
+    split_w[split_w < budget.min_power_w[plan.stage] * (1.0 - TOLERANCE)] = 0.0
+    power_w = np.where(power_w < plan.power_w, split_w, power_w)
     columns = {item.name: getattr(plan, item.name) for item in fields(PulsePlan)}
     columns["power_w"] = power_w
     limited = LimitedPlan(
@@ -166,14 +168,15 @@ def limit(
 def _allow_for_split_period(plan: PulsePlan, power_w: FloatArray, budget: Budget) -> FloatArray:
     """Return the powers, [n], W, at which a laser with a PWM, which begins with the pulse, emits the mean of `power_w`.
 
-    Of a last period that is not whole, the part that is on comes first.
+    Of a last period that is not whole, the part that is on comes first. Of a laser with a curve, it may have all of a
+    period's light.
     """
     period_s, full_w = budget.pwm_period_s[plan.stage], budget.heat.power_max_w[plan.stage]
     periods = plan.width_s / period_s
     is_split = np.abs(periods - np.rint(periods)) * period_s > TICK_ROUNDING_S
     whole, on_periods = np.floor(periods), periods * power_w / full_w
     duty = on_periods / (whole + 1.0)
-    is_on_to_the_end = duty > periods - whole
+    is_on_to_the_end = (duty > periods - whole) & budget.is_proportional[plan.stage]
     duty = np.where(is_on_to_the_end, (on_periods - (periods - whole)) / np.maximum(whole, 1.0), duty)
     return np.where(is_split, np.minimum(duty * full_w, power_w), power_w)
 
@@ -285,6 +288,13 @@ def verify(
     encoded = _EncodedPulses(*(column[order] for column in (*columns, power_w)))
     pixel, stage = (np.concatenate([column[row], column[omitted]])[order] for column in (plan.pixel, plan.stage))
     zero = np.zeros(len(budget.galvos.damping))
+    weak = np.flatnonzero((encoded.power_w > 0.0) & (encoded.power_w < budget.min_power_w[stage] * (1.0 - TOLERANCE)))
+    if len(weak):
+        found, expected_w = encoded.power_w[weak[0]], budget.min_power_w[stage[weak[0]]]
+        raise LocalProtocolError(
+            f"encoded pulse {order[weak[0]]} on pixel {pixel[weak[0]]} is weaker than its laser emits: "
+            f"{found:.4g} W, at least {expected_w:.4g} W"
+        )
     # The slack is for the rounding to come; decoded pulses are rounded already, and would pay for it twice.
     exact = budget._replace(galvos=budget.galvos._replace(rad_per_code=zero, timing_slack_s=zero))
     stop_row, allowed_w, cause, _ = _apply_plan(pixel, stage, encoded, 0.0, state, exact, STOP, on_progress)

@@ -68,7 +68,8 @@ def apply_pulses(
         granted_w[row], cause[row] = request.power_w, NO_CAP
         # Also for a pulse without power: verify() must evaluate the exchange at the same times (see limiter.verify).
         before = compute_start_state(budget, workspace, request)
-        if request.power_w < budget.caps.min_power_w or request.power_w <= 0.0:
+        min_power_w = budget.min_power_w[stage[row]] * (1.0 - TOLERANCE)
+        if request.power_w < min_power_w or request.power_w <= 0.0:
             continue
         if policy != COUNT_ONLY:
             max_w, binding = max_power_w(budget, workspace, request, before)
@@ -77,8 +78,8 @@ def apply_pulses(
                 # A negative power is a refusal (order, width) and holds under TRIM, too.
                 if policy == STOP or max_w < 0.0:
                     return row
-                if granted_w[row] < budget.caps.min_power_w:
-                    # Weaker than the board can emit: dark, and the reason says so.
+                if granted_w[row] < min_power_w:
+                    # Weaker than the laser emits, or the board can let it: dark, and the reason says so.
                     granted_w[row] = 0.0
         if granted_w[row] > 0.0:
             commit(budget, workspace, request, granted_w[row], before)

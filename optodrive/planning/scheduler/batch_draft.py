@@ -11,7 +11,10 @@ from optodrive.planning.scheduler.scan_head import BeamPath
 
 @dataclass(frozen=True)
 class SkippedPulse:
-    """A pulse of a frame or train that was omitted because the residual heat alone reaches its target."""
+    """A pulse of a frame or train that was omitted because the residual heat reaches its target.
+
+    Or comes so near that the weakest pulse that the laser emits would miss it by more.
+    """
 
     source: int
     pixel: int

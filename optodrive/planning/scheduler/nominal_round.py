@@ -35,6 +35,7 @@ class DriveSpan(NamedTuple):
     period_s: float
     max_periods: int
     is_fine: bool
+    min_duty: float
 
 
 class RoundPulses(NamedTuple):
@@ -72,7 +73,7 @@ def draft_round(
     """
     beam, pulses = draft.state.beams[stage], RoundPulses.empty(len(pixel))
     start = KernelBeam(beam.free_us, NO_PIXEL if beam.pixel is None else beam.pixel, beam.arrival_us, beam.dwell_us)
-    span = DriveSpan(drive.max_power_w, drive.period_s, drive.max_periods, drive.is_fine)
+    span = DriveSpan(drive.max_power_w, drive.period_s, drive.max_periods, drive.is_fine, drive.min_duty)
     count = len(pixel) if max_count is None else max_count
     visited, *after = _solve_round(
         *heat.kernel_state, draft.paths[stage].moves, pixel, target_m, earliest_us, until_us, start, span, count, pulses
@@ -139,6 +140,7 @@ def _solve_round(
             1,
             drive.max_periods,
             drive.is_fine,
+            drive.min_duty,
             0.0,
         )
         pulses.start_us[row], pulses.settling_us[row] = start_us, settling_us

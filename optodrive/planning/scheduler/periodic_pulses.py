@@ -103,6 +103,10 @@ def build_pulse_recipe(train: HeightTrain, cold_heat: ThermalState, drive: Drive
         min_periods = periods
     first = cold_heat.solve_pulse(train.pixel, 0.0, train.target_m, drive, min_periods)
     steady_state = solve_steady_state(train, cold_heat, drive, periods, lead_ratio)
+    if steady_state.duty < drive.min_duty:
+        weakest = compute_steady_state(train, cold_heat, drive, periods, drive.min_duty)
+        expected = f"at least {m_to_um(weakest.peak_m):.4g} µm, the height of the weakest pulses that the laser emits"
+        raise InputError(f"{where}.target_um", round(m_to_um(train.target_m), 3), expected, code="bad_train")
     lead_period_w = steady_state.lead_duty * drive.max_power_w
     # A peak within the cycle: the usual way, planned for the peak itself.
     if first is None or _find_first_peak_s(train, cold_heat, drive, *first) <= EARLY_PEAK_FRACTION * train.period_s:
@@ -143,8 +147,7 @@ def _solve_alternatives(
     shapes = [pulse]
     for fraction in CORRECTIONS if bounded_width != steady_width else ():
         width = steady_width + fraction * (bounded_width - steady_width)
-        periods = max(recipe.min_periods, ceil(width))
-        shapes.append((periods, width / periods) if width > 0.0 else None)
+        shapes.append(drive.build_pulse(width, recipe.min_periods))
     return shapes
 
 
@@ -232,18 +235,19 @@ def solve_steady_state(
 ) -> PeriodicSteadyState:
     """Solve for the duty of pulses of the given width whose steady peak is the target, or return full power.
 
-    lead_ratio: duty of the lead period over the duty of the pulse.
+    The pulses of a laser that is on or off are shorter instead. lead_ratio: duty of the lead period over the duty of
+    the pulse.
     """
-    steady_state = compute_steady_state(train, cold_heat, drive, periods, 1.0, lead_ratio)
+    share, steady_state = 1.0, compute_steady_state(train, cold_heat, drive, periods, 1.0, lead_ratio)
     for _ in range(MAX_POWER_CORRECTIONS):
         if abs(steady_state.peak_m / train.target_m - 1.0) < PEAK_TOLERANCE:
             break
-        # Displacement is nearly proportional to power.
-        # Nearly proportional, so a few steps suffice.
-        duty = min(1.0, steady_state.duty * train.target_m / steady_state.peak_m)
-        if duty == steady_state.duty:
+        # Displacement is nearly proportional to energy, so a few steps suffice.
+        before, share = share, min(1.0, share * train.target_m / steady_state.peak_m)
+        if share == before:
             break
-        steady_state = compute_steady_state(train, cold_heat, drive, periods, duty, lead_ratio * duty)
+        shape: Shape = (periods * share, 1.0) if drive.is_on_off else (periods, share)
+        steady_state = compute_steady_state(train, cold_heat, drive, *shape, lead_ratio * share)
     return steady_state
 
 
@@ -311,7 +315,9 @@ def _find_peak_to_peak_shape(
             low_ratio = ratio
         else:
             high_ratio = ratio
-    return low, 0.5 * (low_ratio + high_ratio)
+    ratio = 0.5 * (low_ratio + high_ratio)
+    lead_duty = solve_steady_state(train, cold_heat, drive, low, ratio).lead_duty
+    return (nearest, 0.0) if lead_duty < drive.min_duty else (low, ratio)
 
 
 def _find_first_peak_s(
@@ -325,6 +331,9 @@ def _find_first_peak_s(
 
 
 def limit_pulse_width(drive: DriveRange, max_width_us: int) -> DriveRange:
-    """Limit the drive's pulses to `max_width_us` and whole PWM periods, but to no less than one of them."""
+    """Limit the drive's pulses to `max_width_us`, but to no less than a PWM period.
+
+    They are whole periods, unless the laser is on or off.
+    """
     max_periods = max(1, min(drive.max_periods, int(max_width_us * 1e-6 / drive.period_s + 1e-9)))
-    return replace(drive, max_periods=max_periods, is_fine=False)
+    return replace(drive, max_periods=max_periods, is_fine=drive.is_on_off)

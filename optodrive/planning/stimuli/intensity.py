@@ -141,8 +141,8 @@ def _build_nominal(config: Config, _parameters: str) -> NominalDrive:
     _parameters: content of the parameter set, by which a changed file is told
     """
     # A pixel may get any stage that reaches it, also the one with the least power.
-    weakest = min(config.list_stage_configs(), key=lambda stage: stage.laser.max_power_w).laser
-    drive = DriveRange.from_laser(weakest.max_power_w, weakest.pwm_hz, config.limits.pulse_width_max_s)
+    weakest = min(config.list_stage_configs(), key=lambda stage: stage.laser.max_power_w)
+    drive = DriveRange.from_config(weakest)
     cold = build_cold_state(config, load_parameters(config.pixel_model.parameters))
     return NominalDrive(cold, drive, config.limits.pulse_gap_min_s)
 

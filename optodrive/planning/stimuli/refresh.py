@@ -70,9 +70,7 @@ class BeamTimeEstimator:
         self.lattice = Lattice.from_config(config)
         self._scanner, self._servos = config.scanner, build_servo_range(config.scanner)
         self._tolerance_rad, self._pitch_m = min(config.tolerance_rad), config.display.pitch_m
-        laser = config.laser
-        width_max_s, is_fine = config.limits.pulse_width_max_s, not laser.whole_periods
-        self._drive = DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, width_max_s, is_fine=is_fine)
+        self._drive = DriveRange.from_config(config)
         known = load_pixel_map(config)
         self._lift = None if known is None else known.displacement_factor
         self._galvo_time = GalvoTimeEstimator(config)

@@ -97,6 +97,9 @@ def _validate_height_train(train: HeightTrain, where: str, config: Config) -> He
         peak_to_peak_um = round(m_to_um(train.peak_to_peak_m), 9)
         expected = f"a height above 0, at most target_um = {m_to_um(train.target_m):g} µm"
         raise InputError(f"{where}.peak_to_peak_um", peak_to_peak_um, expected, code="bad_train")
+    if train.peak_to_peak_m is not None and any(laser.is_on_off for laser in config.lasers):
+        value, expected = m_to_um(train.peak_to_peak_m), "none with laser.modulation 'on_off': the height alone sets it"
+        raise InputError(f"{where}.peak_to_peak_um", round(value, 9), expected, code="bad_train")
     if train.peak_to_peak_m is not None:
         _check_height(f"{where}.peak_to_peak_um", train.peak_to_peak_m)
     _check_period(train, where, config)
@@ -149,19 +152,25 @@ def _validate_pulse_train(train: PulseTrain, where: str, config: Config) -> Puls
         expected = f"a power above 0, at most laser.max_power_w = {config.laser.max_power_w:g} W"
         expected += _guess("power_w", train.power_w, config.laser.max_power_w)
         raise InputError(f"{where}.power_w", train.power_w, expected, code="bad_train")
+    weakest_w = max(stage.min_power_w for stage in config.list_stage_configs())
+    if train.power_w < weakest_w * (1 - 1e-9):
+        expected = f"at least {weakest_w:g} W, the weakest pulse of the laser"
+        raise InputError(f"{where}.power_w", train.power_w, expected, code="bad_train")
     place, width_max_s = f"{where}.pulse_width_s", config.limits.pulse_width_max_s
     if not 0 < train.pulse_width_s <= width_max_s * (1 + 1e-9):
         expected = f"a width above 0, at most limits.pulse_width_max_s = {width_max_s:g} s"
         expected += _guess("pulse_width_s", train.pulse_width_s, width_max_s)
         raise InputError(place, train.pulse_width_s, expected, code="bad_train")
     _check_repeats(f"{where}.gap_s", train.gap_s, train.pulse_width_s, train.duration_s)
-    periods = train.pulse_width_s * config.laser.pwm_hz
+    steps_hz = min(laser.width_steps_hz for laser in config.lasers)
+    periods = train.pulse_width_s * steps_hz
     period_count = max(1, round(periods))
     if abs(periods - period_count) > PWM_TOLERANCE_PERIODS:
-        nearest_s = float(f"{period_count / config.laser.pwm_hz:.9g}")
-        expected = f"whole PWM periods of {1 / config.laser.pwm_hz:g} s, nearest is {nearest_s!r}"
+        nearest_s = float(f"{period_count / steps_hz:.9g}")
+        kind = "microseconds" if steps_hz == 1e6 else f"PWM periods of {1 / steps_hz:g} s"
+        expected = f"whole {kind}, nearest is {nearest_s!r}"
         raise InputError(place, train.pulse_width_s, expected, code="bad_train")
-    return replace(train, pulse_width_s=period_count / config.laser.pwm_hz)
+    return replace(train, pulse_width_s=period_count / steps_hz)
 
 
 def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:

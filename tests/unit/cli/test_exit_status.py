@@ -45,8 +45,11 @@ def test_nothing_raised_is_bad_input_or_does_not_fit(frames, command, capsys, tm
     assert "a stimulus that raises nothing: every target is 0" in capsys.readouterr().err
     config = tmp_path / "weak.toml"
     shipped = locate_shipped("display-16.toml").read_text()
-    config.write_text(shipped.replace("[laser]\n", "[laser]\nthreshold_w = 1.0\n"))
-    assert run([command, frames({"trains": [WEAK]}), "--config", str(config)]) == DOES_NOT_FIT
+    config.write_text(shipped.replace("[laser]\n", "[laser]\nthreshold_w = 2.4\n"))
+    assert run([command, frames({"trains": [WEAK]}), "--config", str(config)]) == 2
+    assert "power_w: got 0.5, expected at least 2.4" in capsys.readouterr().err
+    low = {"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"3": 1}}
+    assert run([command, frames({"frames": [low]}), "--config", str(config)]) == DOES_NOT_FIT
     said = "fits: no, no pixel is raised: every pulse is weaker than laser.threshold_w\n"
     assert capsys.readouterr().out.startswith(said)
 

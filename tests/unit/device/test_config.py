@@ -33,8 +33,10 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
     assert set(resolved["laser"]) == {
         "max_power_w",
         "pwm_hz",
+        "modulation",
         "whole_periods",
         "threshold_w",
+        "curve",
         "focus_width_m",
         "focus_height_m",
     }
@@ -94,6 +96,27 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
             "on display.absorber_width_m 0.002",
         ),
         ("focus_height_m = 0.5e-3", "focus_height_m = 1.3e-3", "laser.focus_height_m: got 0.0013", "to fit"),
+        (
+            "[laser]",
+            "[laser]\ncurve = [[0, 0], [0.5, 1.5], [0.6, 1.4], [1, 2.45]]",
+            "laser.curve[2]: got [0.6, 1.4]",
+            "more than 1.5 W, as in the row before",
+        ),
+        ("[laser]", "[laser]\ncurve = [[0, 0], [0.5, 1], [0.5, 2], [1, 2.45]]", "laser.curve[2]", "a duty above 0.5"),
+        ("[laser]", "[laser]\ncurve = [[0, 0], [0.5, 1], [1, 2.4]]", "laser.curve[2]: got [1.0, 2.4]", "[1.0, 2.45]"),
+        ("[laser]", "[laser]\ncurve = [[0.1, 0], [1, 2.45]]", "laser.curve[0]: got [0.1, 0.0]", "[0.0, 0.0]"),
+        (
+            "[laser]",
+            "[laser]\ncurve = [[0, 0], [0.1, 0], [0.2, 0.3], [1, 2.45]]",
+            "laser.threshold_w: got 0.0",
+            "at least 0.3, the first power above 0 of curve",
+        ),
+        (
+            "[laser]",
+            '[laser]\nmodulation = "on_off"\ncurve = [[0, 0], [1, 2.45]]',
+            "laser.curve: got 2 rows",
+            "none with modulation 'on_off'",
+        ),
         ("aim_error_m = 1.0e-4", "aim_error_m = 5.0e-4", "laser.focus_width_m", "scanner.aim_error_m 0.0005"),
     ],
 )
@@ -107,6 +130,29 @@ def test_wrong_values_are_named_with_place_and_expectation(tmp_path, old, new, w
     assert where in str(caught.value)
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "says"),
+    [
+        ("limits", "power_share", 0.5, "limits.power_share: got 0.5, expected 1 with laser.modulation 'on_off'"),
+        (
+            "board",
+            "transport",
+            "helios",
+            "laser.modulation: got 'on_off', expected 'pwm' with board.transport",
+        ),
+    ],
+)
+def test_what_a_laser_that_is_on_or_off_cannot_do_is_refused(section, key, value, says):
+    table = load_config("display-16").model_dump()
+    table["laser"]["modulation"], table[section][key] = "on_off", value
+    if value == "helios":
+        table["scanner"]["half_range_codes"] = 2047
+    with pytest.raises(ValueError, match="on_off") as caught:
+        Config.model_validate(table)
+    found = caught.value.errors()[0]["ctx"]["error"]
+    assert says in f"{found.place}: got {found.value!r}, expected {found.expected}"
 
 
 def test_parameter_sets_carry_unit_and_source_for_every_value():

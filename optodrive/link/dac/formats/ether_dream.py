@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError
-from optodrive.device.config_sections import DAC_POWER_STEPS
+from optodrive.device.config_sections import DAC_POWER_STEPS, ETHER_DREAM_CLOCK_HZ
 from optodrive.link.dac.formats.base import CHUNK_MAX_S, DacFormat, PointTable
 
 TCP_PORT, BROADCAST_PORT = 7765, 7654
@@ -60,7 +60,7 @@ class EtherDreamFormat(DacFormat):
 
     label = "Ether Dream"
     level_max = DAC_POWER_STEPS["ether_dream"]
-    clock_hz = 24_000_000
+    clock_hz = ETHER_DREAM_CLOCK_HZ
     points_max = CAPACITY_MIN // 2
     host_loss_max_s = 2 * CHUNK_MAX_S
     """The buffer holds two chunks at most, and the device stops when it is empty."""

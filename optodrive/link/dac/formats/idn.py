@@ -21,7 +21,7 @@ import struct
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError
-from optodrive.device.config_sections import DAC_POWER_STEPS
+from optodrive.device.config_sections import DAC_POWER_STEPS, IDN_STRETCH
 from optodrive.link.dac.formats.base import DacFormat, PointTable
 
 UDP_PORT = 7255
@@ -52,7 +52,6 @@ HEADER_BYTES = MESSAGE.size + CHUNK.size
 SAMPLE = np.dtype([("x", ">i2"), ("y", ">i2"), ("blue", "u1"), ("intensity", "u1")])
 CODE_STEP, CENTRE_CODE = 16, 2048
 SLICE_POINTS = 210
-STRETCH_MAX = 1.3
 LEAD_S = 0.025
 """How far ahead of the playing sample the host sends."""
 
@@ -78,7 +77,7 @@ class IdnFormat(DacFormat):
     @property
     def stretch(self) -> float:
         """That of OpenIDN's server with an almost empty buffer."""
-        return STRETCH_MAX
+        return IDN_STRETCH
 
     def pack(self, points: PointTable, begin_ticks: int) -> bytes:
         """Return a channel message."""

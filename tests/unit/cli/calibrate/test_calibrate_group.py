@@ -10,10 +10,11 @@ import pytest
 from optodrive.cli.main import run
 
 
-def test_without_a_subcommand_the_help_lists_all_seven(capsys):
+def test_without_a_subcommand_the_help_lists_all(capsys):
     assert run(["calibrate"]) == 2
     output = capsys.readouterr().out
-    assert all(f" {name} " in output for name in ("field", "camera", "board", "steps", "servo", "sweep", "pixels"))
+    names = ("field", "camera", "board", "steps", "servo", "sweep", "pixels", "power", "film")
+    assert all(f" {name} " in output for name in names)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from optodrive.daemon.engine.plan_making import Dimmer, DryRunStart
 from optodrive.daemon.engine.plan_rest import ThermalMemory
 from optodrive.daemon.preview.jobs import plan_dry_run
 from optodrive.daemon.push import BuiltRequest, Push
+from optodrive.planning.display_model import DisplayModel
 from planner_rig import DISPLAY, build_frame, build_train
 
 DUTY_MAX = 65535
@@ -36,6 +37,16 @@ def test_plans_have_at_most_the_share_and_say_why(rig):
     rig.dimmer.set_share(0.0)
     plan, dark = play(rig, build_train(0.1))
     assert (dark, plan.status) == (0, "queued")
+
+
+def test_a_laser_that_is_on_or_off_is_not_dimmed():
+    table = DISPLAY.config.model_dump()
+    config = type(DISPLAY.config).model_validate(table | {"laser": table["laser"] | {"modulation": "on_off"}})
+    dimmer = Dimmer(DisplayModel.from_config(config), ThermalMemory())
+    with pytest.raises(InputError, match=r"share: got 0\.5, expected 0 or 1: with laser\.modulation 'on_off'"):
+        dimmer.set_share(0.5)
+    dimmer.set_share(0.0)
+    assert dimmer.power_share == 0.0
 
 
 def test_a_plan_that_is_being_made_while_the_display_is_dimmed_is_made_again(rig):

@@ -65,15 +65,27 @@ def test_the_default_is_never_more_than_a_spot(any_display):
     assert default_power_w(any_display.config) <= max_spot_power_w(any_display.config)
 
 
-def test_spots_below_the_threshold_are_refused_and_the_default_lies_above(display):
-    laser = display.config.laser.model_copy(update={"threshold_w": 0.03})
-    rig = Rig(DisplayModel.from_config(display.config.model_copy(update={"laser": laser})))
-    assert default_power_w(rig.held.config) == 0.03
-    with pytest.raises(InputError, match=r"got 20 mW, expected at least laser\.threshold_w, 30 mW"):
-        rig.emit(0.02, 1)
+@pytest.mark.parametrize(
+    ("laser", "duty", "width_us"),
+    [
+        ({"threshold_w": 0.245}, 6554, 2000),
+        ({"modulation": "on_off"}, DUTY_MAX, 200),
+        ({"threshold_w": 0.01}, 655, 20_000),
+    ],
+)
+def test_a_laser_that_emits_nothing_so_weak_gets_a_shorter_pulse(display, laser, duty, width_us):
+    table = display.config.model_dump()
+    config = type(display.config).model_validate(table | {"laser": table["laser"] | laser})
+    rig = Rig(DisplayModel.from_config(config))
+    shortest_w = config.min_power_w / config.laser.width_steps_hz / spot_width_s(config)
+    with pytest.raises(InputError, match="mW, that of the laser's weakest and shortest pulse"):
+        rig.emit(0.99 * shortest_w, 1)
     assert not rig.of("gate")
-    rig.emit(0.03, 1)
-    assert len(rig.of("pulse")) == 1
+    rig.emit(default_power_w(config), 1)
+    (pulse,) = rig.of("pulse")
+    assert pulse["duty"] == pytest.approx(duty, abs=1)
+    # No more energy than a spot of a weak laser, and less by at most a PWM period.
+    assert -200 <= pulse["off_us"] - pulse["on_us"] - width_us <= 0
 
 
 @pytest.mark.parametrize(

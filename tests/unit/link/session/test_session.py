@@ -310,7 +310,7 @@ def test_a_fault_is_reported_with_the_pulse_that_it_truncated(rig):
     rig.core.set_input("interlock", False, round(rig.clock.now_s() * 1e6))
     rig.until(lambda: rig.session.board.state == "FAULT")
     rig.run(0.1)
-    done = job.build_executed(planned, 2.45, 1e-6)
+    done = job.build_executed(planned, build_board_requirements(CONFIG).scale)
     assert len(done) == len(rig.pulses())
     assert not done.complete
     assert done.width_s[-1] < planned.width_s[0]
@@ -378,7 +378,7 @@ def test_a_board_that_ended_hold_can_be_armed_again(rig):
     planned = plan(50)
     job = rig.play(planned)
     rig.until(lambda: job.is_finished)
-    assert job.build_executed(planned, 2.45, 1e-6).complete
+    assert job.build_executed(planned, build_board_requirements(CONFIG).scale).complete
 
 
 def test_a_rejected_start_is_reported(rig):

@@ -45,7 +45,7 @@ def test_on_the_simulated_board_only_an_underrun_delays_pulses():
     scale = rig.session.scale
 
     def error_of(job):
-        executed = job.build_executed(limited, scale.full_power_w, scale.tick_s)
+        executed = job.build_executed(limited, scale)
         return compute_timing_error(limited.start_s[job.list_executed_rows()], executed.start_s)
 
     job = rig.play(limited)

@@ -59,7 +59,7 @@ def test_a_plan_is_armed_streamed_and_reported_over_usb():
     rig = Rig().streaming()
     rig.until(lambda: rig.job.is_finished)
     scale = rig.session.scale
-    executed = rig.job.build_executed(rig.plan, scale.full_power_w, scale.tick_s)
+    executed = rig.job.build_executed(rig.plan, scale)
     assert executed.complete
     assert executed.start_s == pytest.approx(rig.plan.start_s)
     rig.session.close()

@@ -31,7 +31,7 @@ from optodrive.planning.limiter.panel_bound import (
 )
 from optodrive.planning.limiter.workspace import PulseHistory, WindowChains, append, max_window_power_w
 from optodrive.planning.limiter.worst_case import build_heat_bound
-from reference_models.thermal_display import NO_CAPS
+from reference_models.thermal_display import NO_CAPS, build_lasers
 
 CERTAIN = Uncertainty(*[0.0] * len(Uncertainty.__dataclass_fields__))
 MODEL = NominalThermalModel(
@@ -57,12 +57,13 @@ SERVO = GalvoModel(
     timing_slack_s=0.0,
     early_s=0.0,
 )
+LASERS = build_lasers(2e-4)
 
 
 def build_budget(**caps):
     """Build a budget in which only the given caps bind."""
     caps = NO_CAPS._replace(**caps)
-    return Budget(caps, build_heat_bound(MODEL, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO), np.full(1, 2e-4))
+    return Budget(caps, build_heat_bound(MODEL, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO), *LASERS)
 
 
 WITHOUT_CAPS = build_budget()
@@ -184,7 +185,7 @@ def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
 def test_a_model_without_walls_is_bounded_by_its_absorber_alone():
     caps = NO_CAPS._replace(absorber_k=150.0)
     bare = replace(MODEL, walls=None, touch=None)
-    budget = Budget(caps, build_heat_bound(bare, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO), np.full(1, 2e-4))
+    budget = Budget(caps, build_heat_bound(bare, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO), *LASERS)
     gentle = run(budget, (1, 0.0, 0.050, 1.0), (1, 9.0, 0.050, 1.0))
     assert gentle.trimmed_j.sum() == 0
     limited = run(budget, (1, 0.0, 0.050, 2.45), (0, 100.0, 0.050, 2.45))

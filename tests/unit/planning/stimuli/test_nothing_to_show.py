@@ -104,7 +104,8 @@ def _nothing_by_plan():
     display = DisplayModel.from_config(CONFIG)
     dead = np.arange(16) == 3
     yield replace(display, dead=dead), "every requested pixel is dead"
-    weak = CONFIG.model_copy(update={"laser": CONFIG.laser.model_copy(update={"threshold_w": 2.44})})
+    # A period at the threshold would raise the pixel by more than twice the target.
+    weak = CONFIG.model_copy(update={"laser": CONFIG.laser.model_copy(update={"threshold_w": 2.44, "pwm_hz": 250.0})})
     yield DisplayModel.from_config(weak), "every pulse is weaker than laser.threshold_w"
 
 

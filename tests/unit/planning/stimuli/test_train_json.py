@@ -109,6 +109,27 @@ def test_a_width_near_whole_periods_is_rounded():
     assert refusal({"pulse_width_s": 0.020003})[0] == "bad_train"
 
 
+def test_trains_of_a_laser_that_is_on_or_off():
+    """They have full power and whole microseconds, and their height sets how far they fall."""
+    table = CONFIG.model_dump()
+    config = type(CONFIG).model_validate(table | {"laser": table["laser"] | {"modulation": "on_off"}})
+
+    def refuse(train):
+        with pytest.raises(InputError) as caught:
+            parse_sequence({"trains": [train]}, config, "f")
+        return str(caught.value)
+
+    (train,) = parse_sequence({"trains": [TRAIN | {"power_w": 2.45, "pulse_width_s": 0.020003}]}, config, "f").trains
+    assert train.pulse_width_s == pytest.approx(0.020003, abs=1e-12)
+    assert "power_w: got 2.4, expected at least 2.45 W" in refuse(TRAIN | {"power_w": 2.4})
+    width = refuse(TRAIN | {"power_w": 2.45, "pulse_width_s": 0.0200035})
+    assert "whole microseconds, nearest is 0.02000" in width
+    fall = refuse(HEIGHTS | {"peak_to_peak_um": 5})
+    assert "peak_to_peak_um: got 5.0, expected none with laser.modulation 'on_off'" in fall
+    alone = {key: value for key, value in HEIGHTS.items() if key != "peak_to_peak_um"}
+    assert parse_sequence({"trains": [alone]}, config, "f").trains
+
+
 def test_pulses_of_two_trains_at_once_are_refused():
     code, message = refusal({}, {"pixel": 18, "start_s": 0.03}, {"pixel": 19, "start_s": 0.165})
     assert code == "overlapping_trains"
