@@ -26,7 +26,11 @@ if TYPE_CHECKING:
     from optodrive.study.trial_log import TrialLog
 
 PARTICIPANTS_MAX = 1000
-STUDY_HELP = "A study file, or a shipped one: detection, equalisation, experiment-1 to experiment-6."
+STUDY_HELP = (
+    "A study file, or a shipped one: apparent-motion, detection, equal-intensity, equalisation, experiment-1 to "
+    "experiment-6, frequency-discrimination, gap-detection, height-threshold, pattern-identification, reading-speed, "
+    "roughness, temporal-order, two-point."
+)
 
 
 def study(
@@ -357,7 +361,8 @@ def _format_report(report: dict[str, Any]) -> Iterator[str]:
     from optodrive.study.threshold import ThresholdEstimate
 
     yield f"study            {report['study']}"
-    yield f"participants     {len(report['participants'])}, {report['trials']} trials in all"
+    participants = {name.partition("_")[0] for name in report["participants"]}
+    yield f"participants     {len(participants)}, {report['trials']} trials in all"
     if report["repeated"]:
         yield f"repeated         {report['repeated']} trials whose first attempt was interrupted or spoiled"
     if "accuracy" in report:

@@ -249,8 +249,8 @@ class Observer:
 
     def _identify(self, shown: Presentation, rng: np.random.Generator) -> str:
         """Name the pattern whose places are nearest to those that are felt."""
-        pixel, visits = np.unique(shown.pixel, return_counts=True)
-        exposure_s = np.full(len(pixel), shown.duration_s / max(1, len(pixel)) + PERSISTENCE_S) * np.maximum(1, visits)
+        pixel = np.unique(shown.pixel)
+        exposure_s = np.full(len(pixel), shown.duration_s + PERSISTENCE_S)
         position_m = np.column_stack([self._layout.x_m[pixel], self._layout.y_m[pixel]])
         felt_m = self._perceive_places(Visits(pixel.tolist(), position_m, exposure_s), rng)
         return min(self._templates, key=lambda name: _measure_distance_m(felt_m, self._templates[name]))

@@ -8,12 +8,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from optodrive.core.errors import InputError, Unquoted, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, Unquoted, suggest_nearest
 from optodrive.core.files import read_bounded
 from optodrive.core.toml_model import ConflictError, Name, Section, check_format, parse_table, read_toml
 from optodrive.planning.stimuli.json_values import decode_json
-from optodrive.study.page_texts import TEXTS, check_text
 from optodrive.study.study_sections import (
+    TEXTS,
     BlockSection,
     CatchSection,
     Factors,
@@ -29,6 +29,7 @@ from optodrive.study.study_sections import (
     StimulusSection,
     Text,
     Value,
+    check_page_text,
 )
 
 FORMAT, VERSION = "optodrive-study", 2
@@ -48,6 +49,8 @@ OBSERVER_ANSWERS: dict[str, tuple[str, ...]] = {
 MAGNITUDE_OBSERVER = "intensity"
 MATCHED_PARAMETERS = ("first", "second", "first_intensity", "second_intensity")
 """Parameters of the stimulus of a matching, which vary between trials."""
+TEXT_QUOTES = re.compile(r"\"\"\"|'''")
+"""Beginning or end of a text of several lines."""
 GAP = "gap_s"
 """The factor, or parameter of a procedure, that is the time between two intervals."""
 
@@ -122,7 +125,7 @@ class Study(Section):
         if len(set(names)) < len(names):
             raise ConflictError("questions", names, "names that differ")
         for key, text in self.texts.items():
-            check_text(key, text)
+            check_page_text(key, text)
         self._check_observer()
         return self
 
@@ -158,7 +161,7 @@ class Study(Section):
         is_shown = self.stimulus.pattern is not None or self.stimulus.frames is not None
         others = [*self.intervals, *(level for levels in self.levels.values() for level in levels.values())]
         if not is_shown and not any(each.pattern is not None or each.frames is not None for each in others):
-            raise ConflictError("stimulus.pattern", None, "a pattern, or frames")
+            raise ConflictError("stimulus.pattern", MISSING, "a pattern, or frames")
 
     def _check_blocks(self) -> None:
         names = [block.name for block in self.blocks]
@@ -220,7 +223,7 @@ class Study(Section):
                 expected = f"one of {', '.join(self.interval_names)}, without a correct answer"
                 raise ConflictError("procedure.equal_interval", procedure.equal_interval, expected)
         elif not self.response.rules:
-            raise ConflictError("response.correct_factor", None, "a factor: a threshold needs correct answers")
+            raise ConflictError("response.correct_factor", MISSING, "a factor: a threshold needs correct answers")
         names = {name for place, name, _ in self._list_factors() if not place.startswith("practice")}
         if procedure.parameter in {*names, *self.stimulus.parameters}:
             raise ConflictError("procedure.parameter", procedure.parameter, "neither a factor nor a constant")
@@ -351,9 +354,50 @@ def load_study(source: str) -> Study:
     if not path.is_file():
         raise InputError("study", source, "a file, or " + ", ".join(names))
     table = read_toml(path)
-    check_format(path, table, FORMAT, VERSION)
-    _read_frames(path, "", table)
-    return parse_table(path, table, Study)
+    try:
+        check_format(path, table, FORMAT, VERSION)
+        _read_frames(path, "", table)
+        return parse_table(path, table, Study)
+    except InputError as error:
+        line = _find_line(path, error.where.removeprefix(f"{path}: "))
+        if line is None or not error.where.startswith(f"{path}: "):
+            raise
+        where = error.where.replace(f"{path}: ", f"{path}, line {line}: ", 1)
+        raise InputError(where, error.value, error.expected, error.code) from None
+
+
+def _find_line(path: Path, place: str) -> int | None:
+    """Return the line of a TOML file that states a dotted key, or else the nearest table around it."""
+    sought, found, best = place.split("."), None, 0
+    table: list[str] = []
+    counts: dict[str, int] = {}
+    is_within_text = False
+    for number, text in enumerate(path.read_text("utf-8-sig").splitlines(), start=1):
+        was_within_text, is_within_text = is_within_text, is_within_text ^ bool(len(TEXT_QUOTES.findall(text)) % 2)
+        if was_within_text:
+            continue
+        header = re.match(r"\s*(\[\[?)([^\[\]]+)\]", text)
+        key = re.match(r"""\s*((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""", text)
+        if header is None and key is None:
+            continue
+        if header is not None:
+            table = parts = _split_key(header[2])
+            if header[1] == "[[":
+                name = ".".join(parts)
+                counts[name] = counts.get(name, -1) + 1
+                table = [*parts, str(counts[name])]
+                parts = parts if parts == sought else table
+        elif key is not None:
+            parts = table + _split_key(key[1])
+        depth = len(parts) if parts == sought[: len(parts)] else 0
+        if depth > best:
+            found, best = number, depth
+    return found
+
+
+def _split_key(text: str) -> list[str]:
+    """Return the parts of a dotted key, a quoted one split at its dots as in the place of an error."""
+    return [part for part in re.sub(r"""["'\s]""", "", text).split(".") if part]
 
 
 def _read_frames(path: Path, place: str, table: Any) -> None:

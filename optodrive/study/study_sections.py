@@ -1,11 +1,15 @@
 """Sections of a study file: stimuli, intervals, order, blocks, practice, responses, questionnaires and simulation."""
 
+import json
+import re
+from importlib.resources import files
 from itertools import pairwise
 from math import isclose
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from optodrive.core.errors import MISSING, suggest_nearest
 from optodrive.core.toml_model import ConflictError, Name, Section
 from optodrive.study.threshold import Procedure
 
@@ -13,6 +17,9 @@ CHANCE_TOLERANCE = 1e-3
 TEXT_MAX = 5000
 NUMBER_MAX = 1e9
 """Bound of a number that a participant may answer."""
+
+TEXTS: dict[str, str] = json.loads(files("optodrive.study").joinpath("page", "texts.json").read_bytes())
+"""Sentences of the participant's page and of the terminal by key. Words in braces stand for what is filled in."""
 
 Value = str | int | float
 Factors = dict[str, Annotated[tuple[Value, ...], Field(min_length=1)]]
@@ -28,6 +35,16 @@ Text = Annotated[str, Field(min_length=1, max_length=TEXT_MAX), AfterValidator(_
 """A text of several lines that people read."""
 Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,39}$")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+def check_page_text(key: str, text: str) -> None:
+    """Raise ConflictError for a sentence that the page has not, or that lacks or adds a word in braces."""
+    place = f"texts.{key}"
+    if key not in TEXTS:
+        raise ConflictError(place, key, f"a sentence of the page, {suggest_nearest(key, list(TEXTS))}")
+    words, found = (sorted(re.findall(r"\{\w*\}|[{}\n]", each)) for each in (TEXTS[key], text))
+    if found != words:
+        raise ConflictError(place, text, f"one line with {' and '.join(words) or 'no braces'}")
 
 
 class StimulusSection(Section):
@@ -187,7 +204,7 @@ class ResponseSection(Section):
         is_given = self.chance_level is not None and isclose(self.chance_level, share, abs_tol=CHANCE_TOLERANCE)
         if not is_given and (self.rules or self.chance_level is not None):
             expected = f"{share:.4f}, for one of {len(self.answers)} answers"
-            raise ConflictError("chance_level", self.chance_level, expected)
+            raise ConflictError("chance_level", MISSING if self.chance_level is None else self.chance_level, expected)
         if self.min_s is not None and self.max_s is not None and self.min_s >= self.max_s:
             raise ConflictError("max_s", self.max_s, f"more than min_s, {self.min_s:g}")
         return self

@@ -1,11 +1,11 @@
 """Answers of a person at a terminal: one line each, read aloud by a screen reader as any text."""
 
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from typing import Any
 
-from optodrive.study.page_texts import fill_text
 from optodrive.study.presenter import Presentation
 from optodrive.study.session import RepeatReason, Respondent, Response
 from optodrive.study.study_file import Study
@@ -14,6 +14,11 @@ from optodrive.study.trial_list import ListedTrial
 
 REPEAT, REPEAT_WORD = "0", "again"
 """Answers that ask for the stimulus once more; the second one where an answer of the study begins with the first."""
+
+
+def fill_text(texts: Mapping[str, str], key: str, **values: object) -> str:
+    """Return a sentence of the page with its words in braces replaced."""
+    return re.sub(r"\{(\w+)\}", lambda found: str(values[found[1]]), texts[key])
 
 
 class TerminalRespondent(Respondent):

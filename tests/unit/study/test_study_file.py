@@ -9,6 +9,7 @@ from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.study.study_file import EXPERIMENTS, list_shipped_studies, load_study
 from optodrive.study.trial_list import list_trials
+from optodrive.study.trial_stimulus import check_stimuli
 
 TRIALS = {1: 20, 2: 36, 3: 45, 4: 72, 5: 24, 6: 30}
 """Trials per participant (Text S5)."""
@@ -17,8 +18,17 @@ CORRECT_PERCENT = {1: 100.0, 2: 94.7, 3: 78.4, 5: 89.6, 6: 96.3}
 CHANCE_PERCENT = {1: 25.0, 2: 50.0, 3: 11.1, 5: 33.3, 6: 16.7}
 
 
-def test_the_six_experiments_are_shipped():
-    assert list_shipped_studies() == ["detection", "equalisation", *(f"experiment-{number}" for number in range(1, 7))]
+def test_the_six_experiments_and_ten_other_designs_are_shipped():
+    names = list_shipped_studies()
+    assert [name for name in names if name.startswith("experiment-")] == [f"experiment-{k}" for k in range(1, 7)]
+    assert len(names) == 18
+
+
+@pytest.mark.parametrize("name", list_shipped_studies())
+def test_a_shipped_study_is_one_of_the_display(name):
+    study = load_study(name)
+    assert study.name == name
+    check_stimuli(study, load_config())
 
 
 @pytest.mark.parametrize("number", range(1, 7))
@@ -56,39 +66,108 @@ def test_the_order_has_every_condition_as_often_and_differs_between_participants
     assert order != list_trials(study.model_copy(update={"seed": 9}), "01")
 
 
+EXPERIMENT = [
+    ("version = 2", "version = 1", "line 4: version: got 1, expected 2, the one this release reads"),
+    ("chance_level = 0.25", "chance_level = 0.5", "response.chance_level: got 0.5, expected 0.2500"),
+    ("chance_level = 0.25\n", "", "line 18: response.chance_level: missing, expected 0.2500"),
+    ('correct_factor = "direction"', 'correct_factor = "speed"', "correct_factor: got 'speed', expected one of"),
+    ("repetitions = 5", "repetitions = 0", "line 8: repetitions: got 0"),
+    ("repetitions = 5", "repetitons = 5", "line 8: repetitons: got 'repetitons', expected a known key, nearest is"),
+    ('direction = ["left",', 'direction = ["north",', "factors.direction: got 'north', expected one of the answers"),
+    ('direction = ["left",', 'direction = ["right",', "line 16: factors.direction"),
+    ('name = "experiment-1"', 'name = "Experiment 1"', "name: got 'Experiment 1', expected small letters and digits"),
+    ('direction = ["left",', 'direction = [true, "left",', "factors.direction.0: got True, expected text or a"),
+    ('observer = "linear-motion"', 'observer = "intensity"', "an observer whose answers are left, right, up, down"),
+    ('observer = "linear-motion"', 'observer = "order"', "those of this one are none here"),
+    ('observer = "linear-motion"', 'observer = "interval"', "it names one of 0 intervals, the study has 4 answers"),
+    ("seed = 1", 'seed = "1"', "line 7: seed: got '1'"),
+    ("seed = 1", "seed = 1\nbreak_every = 0", "line 8: break_every: got 0"),
+    ("seed = 1", 'seed = 1\nlanguage = "German"', "language: got 'German', expected text of the form"),
+    (
+        "seed = 1",
+        'seed = 1\ntexts = { redy = "x" }',
+        "texts.redy: got 'redy', expected a sentence of the page, nearest is",
+    ),
+    (
+        "seed = 1",
+        'seed = 1\ntexts = { trial = "Nr." }',
+        "texts.trial: got 'Nr.', expected one line with {count} and {n",
+    ),
+    ("[response]", "[procedure]\n[response]", "line 18: procedure.kind: missing"),
+]
+DISCRIMINATION = [
+    (
+        'correct_interval = "comparison"',
+        'correct_interval = "third"',
+        "response.correct_interval: got 'third', expected",
+    ),
+    (
+        'correct_interval = "comparison"',
+        "correct_position = 1",
+        "intervals: got 'standard', expected one of the answers",
+    ),
+    (
+        'shows = "standard"',
+        'shows = "third"',
+        "catch.shows: got 'third', expected one of nothing, standard, comparison",
+    ),
+    ("[catch]\n", "[catch]\nerrors_max = 0.2\n", "catch.errors_max: got 0.2, expected a catch.answer beside it"),
+    ("[catch]\n", '[catch]\nanswer = "none"\n', "catch.answer: got 'none', expected one of the answers"),
+    ('answers = ["first", "second"]', 'answers = ["1", "2", "3"]', "response.chance_level: got 0.5"),
+    ("trials_max = 24", "trials_max = 3", "practice.trials_max: got 3, expected at least 6"),
+    ("trials_max = 24\n", "", "practice.trials_max: got None, expected stated beside a criterion"),
+    (
+        "factors = { rate_hz = [50.0] }",
+        "factors = { rate = [50.0] }",
+        "practice.factors.rate: got [50.0], expected a factor",
+    ),
+    ("gap_s = 0.5", "gap_s = -0.5", "intervals.1.gap_s: got -0.5, expected greater than or equal to 0"),
+    (
+        'name = "comparison" ',
+        'name = "standard" ',
+        "intervals: got ['standard', 'standard'], expected names that differ",
+    ),
+    (
+        "[order]",
+        '[order]\nblocked_by = "rate"',
+        "order.blocked_by: got 'rate', expected a factor, nearest is 'rate_hz'",
+    ),
+    ("min_s = 0.1", "min_s = 9.0", "response.max_s: got 8.0, expected more than min_s, 9"),
+    ('name = "hand"', 'name = "age"', "questions: got ['age', 'age', 'strategy'], expected names that differ"),
+    ('answers = ["left", "right", "both"]', "", "questions.1.answers: got [], expected at least two"),
+    ("[catch]", '[levels.rate_hz]\n"99.0" = {}\n[catch]', "levels.rate_hz: got '99.0', expected a value of the factor"),
+    ("[catch]", "[levels.rate]\nx = {}\n[catch]", "levels.rate: got 'rate', expected a factor, nearest is 'rate_hz'"),
+    (
+        'pattern = "vibration"',
+        'pattern = "vibration"\nframes = { trains = [] }',
+        "stimulus.frames: got 'a file', expected",
+    ),
+    ('pattern = "vibration"\n', "", "stimulus.pattern: missing, expected a pattern, or frames"),
+    ("[catch]", '[[blocks]]\nname = "A"\n[catch]', "blocks.0.name: got 'A'"),
+]
+
+
 @pytest.mark.parametrize(
-    ("old", "new", "says"),
+    ("name", "old", "new", "says"),
     [
-        ("version = 2", "version = 1", "version: got 1, expected 2, the one this release reads"),
-        ("chance_level = 0.25", "chance_level = 0.5", "response.chance_level: got 0.5, expected 0.2500"),
-        ('correct_factor = "direction"', 'correct_factor = "speed"', "correct_factor: got 'speed', expected one of"),
-        ("repetitions = 5", "repetitions = 0", "repetitions: got 0"),
-        ("repetitions = 5", "repetitons = 5", "nearest is 'repetitions'"),
-        (
-            'direction = ["left",',
-            'direction = ["north",',
-            "factors.direction: got 'north', expected one of the answers",
-        ),
-        ('direction = ["left",', 'direction = ["right",', "factors.direction"),
-        (
-            'name = "experiment-1"',
-            'name = "Experiment 1"',
-            "name: got 'Experiment 1', expected small letters and digits",
-        ),
-        ('direction = ["left",', 'direction = [true, "left",', "factors.direction.0: got True, expected text or a"),
-        ('observer = "linear-motion"', 'observer = "intensity"', "an observer whose answers are left, right, up, down"),
-        ("seed = 1", 'seed = "1"', "seed: got '1'"),
+        *(("experiment-1", *each) for each in EXPERIMENT),
+        *(("frequency-discrimination", *each) for each in DISCRIMINATION),
     ],
 )
-def test_a_wrong_file_is_told_in_one_line(tmp_path, old, new, says):
-    text = (EXPERIMENTS / "experiment-1.toml").read_text()
+def test_a_wrong_file_is_refused_in_one_line(tmp_path, name, old, new, says):
+    text = (EXPERIMENTS / f"{name}.toml").read_text()
     assert old in text
     path = tmp_path / "study.toml"
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError) as error:
         load_study(str(path))
-    assert says in str(error.value)
-    assert "\n" not in str(error.value)
+    message = str(error.value)
+    assert says in message
+    assert "\n" not in message
+    assert message.startswith(f"{path}, line ")
+    stated = int(message.removeprefix(f"{path}, line ").partition(":")[0])
+    changed = path.read_text().splitlines()
+    assert 1 <= stated <= len(changed)
 
 
 def test_an_unknown_study_is_told_the_shipped_ones():
