@@ -1,5 +1,7 @@
 """Small synthetic recordings for unit tests of the diagnosis, made with the package's own pixel model."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from optodrive.core.types.measurements import Measurement, Run, Signal
@@ -10,6 +12,7 @@ from optodrive.physics.terms import discover_terms
 
 PIXEL = Pixel(180.0, 100e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
 AMBIENT_K = 293.15
+SLACK_M = 4e-5
 GROUPS = {
     "short": [(0.02, 0.005, 2.45, 0.0)],
     "weak": [(0.02, 0.06, 0.8, 0.0)],
@@ -55,4 +58,16 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0, co
                 noisy[rng.random(len(t_s)) < 0.01 * (noise > 0)] = np.nan
                 signals[signal] = Signal(0, t_s, noisy + (AMBIENT_K if signal.endswith("_K") else 0.0))
             runs.append(Run(f"run{len(runs):03d}", AMBIENT_K, pulses, signals, attributes))
+    return Measurement(tuple(runs))
+
+
+def lab_with_slack(seed):
+    """Return the recording of a membrane whose first part of the displacement, SLACK_M, is missing."""
+    runs = []
+    for noisy, exact in zip(lab(seed, {}).runs, lab(seed, {}, noise=0.0).runs, strict=True):
+        signal = noisy.signals["displacement_m"]
+        missing_m = np.minimum(exact.signals["displacement_m"].value, SLACK_M)
+        runs.append(
+            replace(noisy, signals=noisy.signals | {"displacement_m": replace(signal, value=signal.value - missing_m)})
+        )
     return Measurement(tuple(runs))

@@ -1,14 +1,12 @@
 """A term that no catalogue holds is found in a recording of a pixel, and nothing where nothing is hidden."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from labs import AMBIENT_K, PIXEL, lab
+from labs import AMBIENT_K, PIXEL, SLACK_M, lab, lab_with_slack
 from optodrive.cli.main import run
-from optodrive.core.types.measurements import Measurement
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
 from optodrive.lab.diagnosis.narrative import build_model_toml
@@ -17,7 +15,7 @@ from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_s
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 
-SLACK_M, WIDTH_M = 4e-5, 0.4e-3
+WIDTH_M = 0.4e-3
 TRUE_BASE = {
     "R": PIXEL.r_k_per_w,
     "C": PIXEL.c_j_per_k,
@@ -26,18 +24,6 @@ TRUE_BASE = {
     "phi": PIXEL.phi_n_per_k,
 }
 pytestmark = pytest.mark.timeout(600)
-
-
-def lab_with_slack(seed):
-    """Return the recording of a membrane whose first part of the displacement is missing."""
-    runs = []
-    for noisy, exact in zip(lab(seed, {}).runs, lab(seed, {}, noise=0.0).runs, strict=True):
-        signal = noisy.signals["displacement_m"]
-        missing_m = np.minimum(exact.signals["displacement_m"].value, SLACK_M)
-        runs.append(
-            replace(noisy, signals=noisy.signals | {"displacement_m": replace(signal, value=signal.value - missing_m)})
-        )
-    return Measurement(tuple(runs))
 
 
 def test_nothing_is_found_where_nothing_is_hidden(tmp_path, capsys):

@@ -18,8 +18,10 @@ from worlds import (
     write_checkout,
     write_film,
     write_measured,
+    write_motor,
     write_recordings,
     write_script,
+    write_slack,
     write_stimuli,
 )
 
@@ -55,8 +57,6 @@ ELSEWHERE = {
     "optodrive token": "tests/unit/cli/test_token_command.py",
     "optodrive plan frames.json --pixel-map": "tests/accuracy/test_calibrate_pixels.py",
     "optodrive simulate sweep/": "tests/accuracy/test_calibrate_pixels.py",
-    "optodrive discover": "tests/accuracy/test_discovery.py",
-    "optodrive diagnose recording.h5 --discover": "tests/accuracy/test_pixel_discovery.py",
     "pip install ./lab-patterns": "tests/system/test_pattern_plug_ins.py installs it",
     "optodrive diagnose film.h5 --out cluster/ --dask": "tests/accuracy/test_display_diagnosis.py starts a cluster",
 }
@@ -85,6 +85,8 @@ SCENARIOS = {
         write_checkout,
         ["docs/how-to/run-a-study.md:The paper's experiments, simulated", "docs/how-to/find-thresholds.md:Thresholds"],
     ),
+    "discovery": (write_motor, ["docs/how-to/discover-a-term.md:Find what a simulation lacks"]),
+    "discovery-in-a-pixel": (write_slack, ["docs/how-to/discover-a-term.md:In a pixel"]),
     "film": (write_film, ["docs/explanation/diagnosis.md:Whole displays"]),
     "recordings": (write_recordings, ["docs/reference/recordings.md:Recordings"]),
     "recordings-python": (write_film, ["docs/reference/recordings.md:From Python"]),
@@ -102,11 +104,7 @@ DRAWINGS = {
     "docs/explanation/architecture.md": ("FrameSequence →", "core < device"),
     "docs/how-to/reach-it-from-the-network.md": ("lab.example {", "server {", "location /lab/"),
     "docs/how-to/wire-a-board.md": ("PC ── USB",),
-    "docs/how-to/discover-a-term.md": (
-        "from optodrive.lab.discovery import ",
-        "dspeed/dt lacks ",
-        "A term that nobody wrote down",
-    ),
+    "docs/how-to/discover-a-term.md": ("from optodrive.lab.discovery import ",),
     "docs/reference/recordings.md": ("/        ", "recording.toml   "),
 }
 """Beginnings of indented blocks that are drawings, layouts of files or configurations of other programs."""

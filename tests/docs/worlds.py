@@ -9,13 +9,15 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from pages import list_examples
 from shown_output import find_difference
 
 from display_lab import display_lab
+from foreign_systems import motor_record
 from hidden_field import CONFIG, grid_codes, measure_spots
 from hidden_servo import HiddenServo
 from hidden_servo import recording as record_servos
-from labs import lab
+from labs import lab, lab_with_slack
 from optodrive.device.config_file import list_shipped_configs, locate_shipped
 from optodrive.lab.calibration.spots import write_spots
 from optodrive.lab.recording.writer import write_recording
@@ -168,6 +170,21 @@ def write_recordings(folder):
     with h5py.File(folder / "swapped.h5", "r+") as file:
         times_s = file["runs/run003/displacement_m/t_s"]
         times_s[81] = times_s[80] - 5e-4
+
+
+def write_motor(folder):
+    """Write the model of a motor as its page prints it, and a record of one with dry friction."""
+    (model,) = (item.text for item in list_examples() if item.is_python and "OdeModel(" in item.text)
+    (folder / "motor.py").write_text(model)
+    record = motor_record(1, 12.0)
+    columns = np.column_stack([record.t_s, record.inputs, record.outputs])
+    rows = "\n".join(",".join(map(repr, row)) for row in columns.tolist())
+    (folder / "monday.csv").write_text(f"t_s,voltage,encoder\n{rows}\n")
+
+
+def write_slack(folder):
+    """Write the recording of a membrane that no known cause explains."""
+    write_recording(folder / "recording.h5", lab_with_slack(32))
 
 
 def write_film(folder):
