@@ -180,8 +180,10 @@ def average_windows(t_s: FloatArray, columns: FloatArray, windows: Windows) -> t
 
     Times count windows, in units of the shortest one, because noise that was averaged by samples follows their number.
     """
+    if all(item.count == 1 for item in windows):  # first: it is asked for with every fit of every signal
+        return t_s, columns
     window = find_window(t_s, windows)
-    if window is None or max(item.count for item in windows) == 1:
+    if window is None:
         return t_s, columns
     label = ((t_s - t_s[0]) / (window.count * window.interval_s) + 1e-6).astype(np.int64)
     starts = np.flatnonzero(np.diff(label, prepend=-1))
