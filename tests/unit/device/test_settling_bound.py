@@ -139,3 +139,42 @@ def test_no_steps_settle_a_move_of_one_pitch_before_the_slew_limit_allows(half_w
     t_s = np.arange(0.0, 4e-4, 1e-6)
     angles_rad = ExactServo(scanner).angles(at_s, np.array([level_rad for _, level_rad in steps]), t_s)
     assert (angles_rad[t_s < reached_s - 2e-6] < enough_rad).all()
+
+
+def follow_shapes(servos, at_s, level_rad, pitch_rad, tolerance_rad):
+    """Return settling times [k] over the corners of a range, and the nominal servo's mean square of acceleration [k].
+
+    Each of k shapes is a step to a level at 0 and one to the pitch at a time.
+    """
+    step_s, times = 2e-6, 220
+    settled_s, square = np.zeros(len(at_s)), None
+    for place in ((0.0, 0.0, 0.0), *product((-1.0, 0.0, 1.0), repeat=3)):
+        servo = servos.servo_at(*place, 1.0)
+        target, angle, speed, total = (np.zeros(len(at_s)) for _ in range(4))
+        last_s = np.zeros(len(at_s))
+        for k in range(times):
+            command_rad = np.where(k * step_s < at_s, level_rad, pitch_rad)
+            target += np.clip(command_rad - target, -servo.slew * step_s, servo.slew * step_s)
+            omega = 2.0 * np.pi * servo.frequency
+            acceleration = omega**2 * (target - angle) - 2.0 * servo.damping * omega * speed
+            speed = speed + acceleration * step_s
+            angle = angle + speed * step_s
+            total += acceleration**2
+            last_s[np.abs(angle - pitch_rad) > tolerance_rad] = (k + 1) * step_s
+        square = total if square is None else square
+        settled_s = np.maximum(settled_s, servo.delay + last_s)
+    return settled_s, square
+
+
+@pytest.mark.parametrize(("half_width", "plain_us", "shaped_us"), [(0.1, 378, 351), (0.02, 333, 278)])
+def test_two_steps_settle_sooner_only_where_they_heat_the_coils_more(half_width, plain_us, shaped_us):
+    """A shape that brings the pitch on sooner costs mean square of acceleration, which is what binds standing pages."""
+    servos, (_, tolerance_rad) = ServoRange(SHIPPED.servo, *[half_width] * 3, 1e-5), DISPLAY_437.tolerance_rad
+    pitch_rad = DISPLAY_437.display.pitch_m / (2.0 * DISPLAY_437.scanner.focal_length_m)
+    at_s, level = (each.ravel() for each in np.meshgrid(np.arange(2e-5, 2.5e-4, 1e-5), np.arange(0.0, 2.2, 0.05)))
+    settled_s, square = follow_shapes(servos, at_s, level * pitch_rad, pitch_rad, tolerance_rad)
+    plain = np.argmin(np.abs(level - 1.0) + at_s)
+    assert 1e6 * settled_s[plain] == pytest.approx(plain_us, abs=4.0)
+    assert 1e6 * settled_s.min() == pytest.approx(shaped_us, abs=6.0)
+    no_hotter = square <= (1.0 + 1e-9) * square[plain]
+    assert settled_s[no_hotter].min() >= settled_s[plain] - 4e-6
