@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from circuit import NETS, PARTS, list_wires
+from circuit import Circuit
 
 OFF_MAX_V = 0.4
 """Largest voltage at the laser's input, above its GND, with the gate off: half of what TTL takes as low."""
@@ -27,7 +27,6 @@ RELAY_MIN_A = 0.03
 SUPPLY_MIN_V = 1.0
 HIGH_MIN_V, LOW_MAX_V = 2.0, 0.8
 """Levels of the Pico's inputs."""
-SUPPLIES = {"5V": "J1.5V", "3V3": "A1.3V3", "+12V": "J2.+12V", "-12V": "J2.-12V"}
 INPUTS = {"STOP": "A1.GP8", "KEY": "A1.GP9", "DOOR": "A1.GP10"}
 
 TERMINALS = {"R4.1": "X1.TTL"}
@@ -64,11 +63,13 @@ class Outcome(NamedTuple):
         for name, fault in (("STOP", "ESTOP"), ("KEY", "KEY"), ("DOOR", "INTERLOCK")):
             if self.reads[name] < HIGH_MIN_V:
                 return f"FAULT {fault}"
-        return "FAULT READBACK" if self.reads["READBACK"] > LOW_MAX_V else ""
+        if self.reads["READBACK"] > LOW_MAX_V:
+            return "FAULT READBACK"
+        return "FAULT HEAD" if self.reads.get("HEAD", 0.0) > 0.0 else ""
 
 
-def build_deck(gate: str, cut: str = "", missing: str = "", rise_s: float = 0.0) -> str:
-    """Build the circuit for ngspice.
+def build_deck(circuit: Circuit, gate: str, cut: str = "", missing: str = "", rise_s: float = 0.0) -> str:
+    """Build a circuit for ngspice. A scan head's line of status is high while GP14 is low.
 
     gate: of GP14: low, high, open, or a source of ngspice; cut: pin whose wire is cut; missing: net whose supply is;
     rise_s: time in which the supplies rise from 0, 0 if they stand
@@ -77,13 +78,13 @@ def build_deck(gate: str, cut: str = "", missing: str = "", rise_s: float = 0.0)
     def node(pin: str) -> str:
         if cut in (pin, TERMINALS.get(pin)):
             return "cut"
-        return next((_spell(net) for net, pins in NETS.items() if pin in pins), _spell(pin))
+        return next((_spell(net) for net, pins in circuit.nets.items() if pin in pins), _spell(pin))
 
     lost = "5V" if cut in ("A1.VSYS", "J1.5V") else missing  # the Pico is without supply then, too
     lines = ["circuit of a Pico", MODELS, "Rcut cut 0 1g"]
-    for reference in PARTS:
-        lines += _describe(reference, partial(_locate, node, reference), gate, lost)
-    lines += [f"Rnet{k} {_spell(net)} 0 1g" for k, net in enumerate(NETS) if net != "GND"]
+    for reference, part in circuit.parts.items():
+        lines += _describe(reference, part.value.lower(), partial(_locate, node, reference), gate, lost)
+    lines += [f"Rnet{k} {_spell(net)} 0 1g" for k, net in enumerate(circuit.nets) if net != "GND"]
     text = "\n".join([*lines, ".end", ""])
     return re.sub(r"^(V\w+ \w+ \w+) (-?[\d.]+)$", rf"\1 pwl(0 0 {rise_s} \2)", text, flags=re.M) if rise_s else text
 
@@ -97,10 +98,9 @@ def _spell(name: str) -> str:
     return "0" if name == "GND" else re.sub(r"[^0-9a-z]", "_", name.lower().replace("+", "p").replace("-", "m"))
 
 
-def _describe(ref: str, at: Callable[[str], str], gate: str, missing: str) -> Iterator[str]:
+def _describe(ref: str, value: str, at: Callable[[str], str], gate: str, missing: str) -> Iterator[str]:
     """Yield the model of a part. at: the node of one of its pins."""
     kind = ref[0]
-    value = PARTS[ref].value.lower()
     if kind == "R":
         yield f"{ref} {at('1')} {at('2')} {_read_ohms(value)}"
     elif kind == "C":
@@ -120,6 +120,10 @@ def _describe(ref: str, at: Callable[[str], str], gate: str, missing: str) -> It
         yield f"Rlamp {at('+')} {at('-')} 600"
     elif ref in ("U1", "U4"):
         yield from _describe_buffer(ref, at)
+    elif ref == "U5":
+        yield from _describe_line_driver(ref, at)
+    elif ref == "U6":
+        yield from _describe_line_receiver(ref, at)
     elif ref == "U3":
         for side in "AB":
             yield f"B{ref}{side} {ref}{side} 0 v = v({at('V+')}) > 5 ? 1e5*v({at(side + '+')},{at(side + '-')}) : 0"
@@ -131,9 +135,12 @@ def _describe(ref: str, at: Callable[[str], str], gate: str, missing: str) -> It
         yield _describe_supply("5v", at("5V"), at("GND"), 5.0, missing == "5V")
     elif ref == "J2":
         yield _describe_supply("p12v", at("+12V"), at("GND"), 12.0, missing == "+12V")
-        yield _describe_supply("m12v", at("-12V"), at("GND"), -12.0, missing == "-12V")
+        if value != "supply +12 v":
+            yield _describe_supply("m12v", at("-12V"), at("GND"), -12.0, missing == "-12V")
     elif ref == "A1":
         yield from _describe_pico(at, gate, missing)
+    elif ref == "X2" and value == "scan head":
+        yield from _describe_head(at, gate)
     elif ref == "X1":  # the driver's own GND is that of its supply: without it, it has none
         yield f"Rlaser {at('VIN')} {at('GND')} 100"
         yield f"Ileak {at('GND')} {at('TTL')} {LEAK_A}"
@@ -161,6 +168,42 @@ def _describe_buffer(ref: str, at: Callable[[str], str]) -> Iterator[str]:
     yield f"R{ref}i {at(source)} {inside} 10meg"
 
 
+def _describe_line_driver(ref: str, at: Callable[[str], str]) -> Iterator[str]:
+    """Yield an AM26LS31, whose inputs are low here and which draws 80 mA; its pins hold its GND by their clamps."""
+    vcc, inside = at("VCC"), f"{ref.lower()}g"
+    yield f"R{ref}g {at('GND')} {inside} 0.05"
+    yield f"R{ref}q {vcc} {inside} 62"
+    for k in "1234":
+        yield f"R{ref}{k}z {vcc} {at(k + 'Z')} 100"
+        yield f"R{ref}{k}y {at(k + 'Y')} {inside} 25"
+        yield f"R{ref}{k}a {at(k + 'A')} {vcc} 15k"
+        yield from (f"D{ref}{k}{pin} {inside} {at(k + pin)} esd" for pin in "AYZ")
+
+
+def _describe_line_receiver(ref: str, at: Callable[[str], str]) -> Iterator[str]:
+    """Yield an AM26LV32 with a threshold of 0.2 V, whose output of an undecided line is the wrong one."""
+    vcc, inside = at("VCC"), f"{ref.lower()}g"
+    yield f"R{ref}g {at('GND')} {inside} 0.05"
+    yield f"R{ref}q {vcc} {inside} 200"
+    on = f"(v({vcc},{inside}) > 1.5 ? 1 : 0)*(v({at('G')},{inside}) > 1.5 ? 1 : 0)"
+    yield f"B{ref}h {ref}h 0 v = {on}*(v({at('1A')},{at('1B')}) > 0.2 ? 1 : 0)"
+    yield f"B{ref}l {ref}l 0 v = {on}*(v({at('1A')},{at('1B')}) > 0.2 ? 0 : 1)"
+    yield f"S{ref}h {vcc} {at('1Y')} {ref}h 0 closed"
+    yield f"S{ref}l {at('1Y')} {inside} {ref}l 0 closed"
+    yield from (f"R{ref}{pin} {at(pin)} {inside} 12k" for pin in ("1A", "1B"))
+    yield from (f"D{ref}{pin.strip('#')} {inside} {at(pin)} esd" for pin in ("1Y", "G"))
+
+
+def _describe_head(at: Callable[[str], str], gate: str) -> Iterator[str]:
+    """Yield a scan head: 100 Ω across each pair that it receives, and its status of 3 V across that pair."""
+    yield from (f"Rhead{name.lower()} {at(name + '+')} {at(name + '-')} 100" for name in ("CLK", "SYNC", "X", "Y"))
+    high, low = (3.5, 0.5) if gate == "low" else (0.5, 3.5)
+    yield f"Vstatusp headp {at('GND')} {high}"
+    yield f"Vstatusm headm {at('GND')} {low}"
+    yield f"Rstatusp headp {at('STATUS+')} 25"
+    yield f"Rstatusm headm {at('STATUS-')} 25"
+
+
 def _describe_pico(at: Callable[[str], str], gate: str, missing: str) -> Iterator[str]:
     """Yield the Pico: its supply, GP14 as `gate` says, relay closed, lamp on, inputs with their pulls."""
     yield f"Rgnd {at('GND')} pico 0.05"
@@ -178,6 +221,9 @@ def _describe_pico(at: Callable[[str], str], gate: str, missing: str) -> Iterato
     for name in ("GP8", "GP9", "GP10"):
         yield f"R{name} {at(name)} pico 60k"
     yield f"RGP13 {at('GP13')} core 60k"
+    yield f"RGP21 {at('GP21')} pico 60k"
+    if gate != "open" and not lacks:
+        yield from (f"RGP{k} {at(f'GP{k}')} pico 30" for k in (16, 17, 18, 19))
 
 
 def _read_ohms(value: str) -> float:
@@ -205,30 +251,43 @@ def run_ngspice(decks: list[str]) -> list[dict[str, float]]:
     for line in ran.stdout.splitlines():
         if found := re.fullmatch(r"deck (\d+)", line.strip()):
             at = int(found[1])
-        elif (found := re.fullmatch(r"(\S+) = (\S+)", line.strip())) and at >= 0:
+        elif (found := re.fullmatch(r"(?:v\()?([^\s()]+)\)? = (\S+)", line.strip())) and at >= 0:
             results[at][found[1]] = float(found[2])
     if not all(results):
         raise RuntimeError(f"ngspice found no operating point of {results.count({})} decks: {ran.stderr[-500:]}")
     return results
 
 
-def list_outcomes(nets: Collection[str] = tuple(NETS)) -> list[Outcome]:
-    """Return the outcome of every single fault at these nets: the worse of a GP14 that is low and one that is open."""
+def list_outcomes(circuit: Circuit, nets: Collection[str] = ()) -> list[Outcome]:
+    """Return the outcome of every single fault: the worse of a GP14 that is low and one that is open.
+
+    nets: where wires are cut, all if empty
+    """
     faults = [("nothing", "", "")]
-    faults += [(f"wire {pin} ({net})", pin, "") for net, pin in list_wires() if net in nets]
-    faults += [(f"supply {net}", "", net) for net in SUPPLIES]
+    faults += [(f"wire {pin} ({net})", pin, "") for net, pin in circuit.list_wires() if not nets or net in nets]
+    faults += [(f"supply {net}", "", net) for net in circuit.supplies]
     cases = list(itertools.product(faults, ("low", "open")))
-    results = run_ngspice([build_deck(gate, cut, missing) for (_, cut, missing), gate in cases])
-    outcomes = [_read(name, cut, each) for ((name, cut, _), _), each in zip(cases, results, strict=True)]
-    pairs = zip(outcomes[::2], outcomes[1::2], strict=True)
+    results = run_ngspice([build_deck(circuit, gate, cut, missing) for (_, cut, missing), gate in cases])
+    outcomes = [_read(circuit, name, cut, each) for ((name, cut, _), _), each in zip(cases, results, strict=True)]
+    pairs = [_judge_status(*pair) for pair in zip(outcomes[::2], outcomes[1::2], strict=True)]
     return [max(pair, key=lambda outcome: (not outcome.is_dark, outcome.ttl_v)) for pair in pairs]
 
 
-def _read(fault: str, cut: str, volts: dict[str, float]) -> Outcome:
+def _judge_status(high: Outcome, low: Outcome) -> tuple[Outcome, Outcome]:
+    """Note in both whether the Pico lacks the status of a head whose line was high in one, and low in the other."""
+    if "STATUS" in high.reads:
+        is_lost = high.reads["STATUS"] < HIGH_MIN_V or low.reads["STATUS"] > LOW_MAX_V
+        for outcome in (high, low):
+            outcome.reads["HEAD"] = float(is_lost)
+    return high, low
+
+
+def _read(circuit: Circuit, fault: str, cut: str, volts: dict[str, float]) -> Outcome:
     def at(pin: str, net: str) -> float:
         return volts["cut" if pin == cut else _spell(net)]
 
     ground = volts["cut"] if cut == "X1.GND" else 0.0
-    reads = {name: at(pin, name) for name, pin in INPUTS.items()} | {"READBACK": at("A1.GP13", "READBACK")}
+    inputs = INPUTS | {"READBACK": "A1.GP13"} | ({"STATUS": "A1.GP21"} if "STATUS" in circuit.nets else {})
+    reads = {name: at(pin, name) for name, pin in inputs.items()}
     ttl_v, supply_v = at("X1.TTL", "TTL") - ground, at("X1.VIN", "LASER_12V") - ground
     return Outcome(fault, ttl_v, reads, volts["vcoil#branch"], supply_v)

@@ -1,4 +1,4 @@
-"""Write docs/reference/circuit.md and its drawing from the circuit: python firmware_protocol/circuit/page.py.
+"""Write docs/reference/circuit.md and its drawings from the circuits: python firmware_protocol/circuit/page.py.
 
 It needs ngspice for the faults.
 """
@@ -9,49 +9,57 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parent))
 
-from circuit import build_parts_list, build_pin_table, draw
+from circuit import CIRCUITS, Circuit, build_parts_list, build_pin_table, draw
 from faults import OFF_MAX_V, Outcome, list_outcomes
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE, DRAWING = DOCS / "reference" / "circuit.md", DOCS / "pictures" / "circuit.svg"
+PAGE, PICTURES = DOCS / "reference" / "circuit.md", DOCS / "pictures"
 
-TEXT = """# Circuit of a Pico
+TEXT = """# Circuits of a Pico
 
 <!-- Written by firmware_protocol/circuit/page.py from circuit.py: do not edit. -->
 
-The circuit that [the wiring](../how-to/wire-a-board.md) describes, from one source,
-`firmware_protocol/circuit/circuit.py`. **Nobody has built it.** ngspice simulates it with the models of `faults.py`,
-which are simple and pessimistic; SKiDL finds no fault of the electrical rules and writes KiCad's netlist from the
-same source (`tests/firmware/test_circuit.py`).
+The circuits that [the wiring](../how-to/wire-a-board.md) describes, [analog](#analog) and with
+[XY2-100](#xy2-100), from one source, `firmware_protocol/circuit/circuit.py`. **Nobody has built them.** ngspice
+simulates them with the models of `faults.py`, which are simple and pessimistic; SKiDL finds no fault of the
+electrical rules. With it, `python firmware_protocol/circuit/netlist.py xy2-100 board.net` (or `analog`) writes the
+netlist that KiCad imports.
 
-![The parts, each pin with its net](../pictures/circuit.svg)
+In the tables of faults one wire is cut, or one supply is missing, while the gate is off: GP14 drives low, or nothing
+drives it as in a reset; the worse of both stands there. The laser's input must stay below {limit} V, or the relay must
+be open, or the board must see a fault, which opens the relay. A wire is named by the pin at its end. Prices are those
+of 2024, about.
 
-## Pins of the Pico
+What the tables do not cover: two faults at once, a part that fails inside, and mirrors that do not move.
+
+{sections}
+"""
+
+SECTION = """## {title}
+
+![The parts, each pin with its net](../pictures/circuit-{name}.svg)
 
 {pins}
 
-X− and Y− of the galvo drivers get GND. A driver for ILDA's ±10 V across the pair turns half of its angle then: set
-its gain for ±5 V on one line, or state the half as `scanner.range_rad`.
-
-## Parts
-
-Prices are those of 2024, about.
+{remark}
 
 {parts}
 
-## Every single fault
-
-One wire is cut, or one supply is missing, while the gate is off: GP14 drives low, or nothing drives it as in a reset;
-the worse of both stands here. The laser's input must stay below {limit} V, or the relay must be open, or the board
-must see a fault, which opens the relay. {count} faults, none of them leaves the laser on. A wire is named by the pin
-at its end.
+{count} single faults, none of them leaves the laser on:
 
 {faults}
-
-What this table does not cover: two faults at once, a part that fails inside, and mirrors that do not move. A cut wire
-of the DAC (SYNC, CLOCK, DATA) or a missing supply of U2 or U3 leaves mirrors that do not follow, and nothing on this
-board notices it.
 """
+
+TITLES = {"analog": "Analog", "xy2-100": "XY2-100"}
+REMARKS = {
+    "analog": """X− and Y− of the galvo drivers get GND. A driver for ILDA's ±10 V across the pair turns half of
+its angle then: set its gain for ±5 V on one line, or state the half as `scanner.range_rad`. A cut wire of the
+DAC (SYNC, CLOCK, DATA) or a missing supply of U2 or U3 leaves mirrors that do not follow, and nothing on this
+board notices it.""",
+    "xy2-100": """The pins of X2 are those of the connector with 25 pins that most heads have; compare them with
+its manual. The head has its own supply. A cut STATUS pair or an unplugged head is FAULT HEAD. A cut line of
+CLOCK, SYNC, X or Y leaves mirrors that do not follow; whether the head's status then says so is its maker's.""",
+}
 
 
 def _group(outcome: Outcome) -> tuple[str, str]:
@@ -69,21 +77,34 @@ def build_fault_table(outcomes: list[Outcome]) -> str:
     return "\n".join(rows)
 
 
-def build_page() -> str:
-    """Return the page. Raise RuntimeError if a fault leaves the laser on."""
-    outcomes = [outcome for outcome in list_outcomes() if outcome.fault != "nothing"]
+def _build_section(circuit: Circuit) -> str:
+    outcomes = [outcome for outcome in list_outcomes(circuit) if outcome.fault != "nothing"]
     exposed = [outcome.fault for outcome in outcomes if not outcome.is_dark]
     if exposed:
-        raise RuntimeError(f"the laser may be on after: {', '.join(exposed)}")
-    return TEXT.format(
-        pins=build_pin_table(),
-        parts=build_parts_list(),
+        raise RuntimeError(f"{circuit.name}: the laser may be on after: {', '.join(exposed)}")
+    return SECTION.format(
+        name=circuit.name,
+        title=TITLES[circuit.name],
+        remark=REMARKS[circuit.name],
+        pins=build_pin_table(circuit),
+        parts=build_parts_list(circuit),
         faults=build_fault_table(outcomes),
-        limit=OFF_MAX_V,
         count=len(outcomes),
     )
 
 
+def build_page() -> str:
+    """Return the page. Raise RuntimeError if a fault leaves the laser on."""
+    sections = "\n".join(map(_build_section, CIRCUITS.values()))
+    return TEXT.format(limit=OFF_MAX_V, sections=sections).rstrip("\n") + "\n"
+
+
+def locate_drawing(circuit: Circuit) -> Path:
+    """Return the file of a circuit's drawing."""
+    return PICTURES / f"circuit-{circuit.name}.svg"
+
+
 if __name__ == "__main__":
     PAGE.write_text(build_page())
-    DRAWING.write_text(draw())
+    for each in CIRCUITS.values():
+        locate_drawing(each).write_text(draw(each))

@@ -1,6 +1,5 @@
-"""The circuit of a Pico, judged by SKiDL's electrical rules and by ngspice."""
+"""The circuits of a Pico, judged by SKiDL's electrical rules and by ngspice."""
 
-import logging
 import re
 import subprocess
 import sys
@@ -15,9 +14,10 @@ from firmware_ports import require
 CIRCUIT = Path(__file__).parents[2] / "firmware_protocol" / "circuit"
 sys.path.append(str(CIRCUIT))
 
-import circuit  # noqa: E402
 import faults  # noqa: E402
+import netlist  # noqa: E402
 import page  # noqa: E402
+from circuit import ANALOG, CIRCUITS, XY2_100, draw  # noqa: E402
 
 GATE_S = 5e-9
 SCHMITT_V = 0.8, 1.5
@@ -36,63 +36,58 @@ def simulate(deck, tmp_path, *commands):
     return {name: float(value) for name, value in found.items()}
 
 
+EACH = pytest.mark.parametrize("circuit", CIRCUITS.values(), ids=CIRCUITS)
+
 # --- the statement ---
 
 
-def test_every_pin_is_stated_once():
+def change(circuit, parts=None, **nets):
+    """Return a circuit with other pins on some nets, None for a net that is gone, and other parts."""
+    changed = {name: pins for name, pins in (circuit.nets | nets).items() if pins is not None}
+    return circuit._replace(nets=changed, parts=circuit.parts if parts is None else parts)
+
+
+@EACH
+def test_every_pin_is_stated_once(circuit):
     assert circuit.check() == []
 
 
-def test_a_pin_that_is_forgotten_unknown_or_stated_twice_is_named(monkeypatch):
-    monkeypatch.setitem(circuit.NETS, "TTL", ["R2.2", "R3.1", "D1.A", "X1.TTL", "X1.TTL", "R44.1"])
-    assert circuit.check() == ["R44.1: no such pin", "R4.1: stated 0 times", "X1.TTL: stated 2 times"]
+def test_a_pin_that_is_forgotten_unknown_or_stated_twice_is_named():
+    wrong = change(ANALOG, TTL=["R2.2", "R3.1", "D1.A", "X1.TTL", "X1.TTL", "R44.1"])
+    assert wrong.check() == ["R44.1: no such pin", "R4.1: stated 0 times", "X1.TTL: stated 2 times"]
 
 
-def build_skidl(folder, monkeypatch):
-    """Return the circuit as SKiDL's, which writes its files into a folder."""
-    monkeypatch.chdir(folder)
+@pytest.fixture
+def build_skidl(tmp_path, monkeypatch):
+    """Return a function that builds a circuit as SKiDL's, which writes its files into a folder."""
+    pytest.importorskip("skidl")
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["circuit.py"])
-    logging.getLogger().handlers.clear()
-    skidl = pytest.importorskip("skidl")
-    types = skidl.Pin.types
-    kinds = {"input": types.INPUT, "output": types.OUTPUT, "passive": types.PASSIVE, "tristate": types.TRISTATE}
-    kinds |= {"power_in": types.PWRIN, "power_out": types.PWROUT}
-    built, parts = skidl.Circuit(), {}
-    for reference, part in circuit.PARTS.items():
-        pins = [skidl.Pin(num=pin.number, name=pin.name, func=kinds[pin.kind]) for pin in part.pins]
-        parts[reference] = skidl.Part(
-            name=part.value, ref=reference, value=part.value, tool=skidl.SKIDL, dest=skidl.NETLIST, pins=pins,
-            footprint=part.footprint, circuit=built,
-        )  # fmt: skip
-    for net, pins in circuit.NETS.items():
-        joined = skidl.Net(net, circuit=built)
-        for pin in pins:
-            reference, _, name = pin.partition(".")
-            joined += next(each for each in parts[reference].pins if each.name == name)
-        if net == "GND":
-            joined.drive = skidl.POWER
-    for pin in circuit.UNCONNECTED:
-        reference, _, name = pin.partition(".")
-        next(each for each in parts[reference].pins if each.name == name).func = types.NOCONNECT
-    return skidl, built
+    return netlist.build_skidl
 
 
-def test_the_electrical_rules_find_nothing(tmp_path, monkeypatch):
-    skidl, built = build_skidl(tmp_path, monkeypatch)
-    built.ERC()
-    said = [path.read_text() for path in tmp_path.glob("*.erc")]
-    assert (skidl.erc_logger.error.count, skidl.erc_logger.warning.count) == (0, 0), said
-    netlist = str(built.generate_netlist(tool=skidl.KICAD9))
-    assert len(re.findall(r"\(comp\s", netlist)) == len(circuit.PARTS)
-    assert {f'(name "{net}")' in netlist for net in circuit.NETS} == {True}
+@EACH
+def test_the_electrical_rules_find_nothing_and_kicad_gets_a_netlist(circuit, tmp_path):
+    pytest.importorskip("skidl")
+    out = tmp_path / "board.net"
+    command = [sys.executable, netlist.__file__, circuit.name, out]
+    ran = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert f"{len(circuit.parts)} parts, {len(circuit.nets)} nets, no rule broken" in ran.stdout
+    written = out.read_text()
+    assert len(re.findall(r"\(comp\s", written)) == len(circuit.parts)
+    assert {f'(name "{net}")' in written for net in circuit.nets} == {True}
 
 
-def test_two_outputs_on_one_net_break_the_rules(tmp_path, monkeypatch):
-    monkeypatch.setitem(circuit.NETS, "READBACK", ["U4.Y", "A1.GP13", "A1.GP22"])
-    monkeypatch.setattr(circuit, "UNCONNECTED", ("A1.GP20", "U1.2Y", "U1.3Y", "U1.4Y"))
-    skidl, built = build_skidl(tmp_path, monkeypatch)
-    built.ERC()
-    assert skidl.erc_logger.error.count == 1
+@pytest.mark.parametrize(
+    ("circuit", "nets", "freed"),
+    [(ANALOG, {"READBACK": ["U4.Y", "A1.GP13", "A1.GP22"]}, "A1.GP22"),
+     (XY2_100, {"STATUS": ["U6.1Y", "A1.GP21", "U6.2Y"]}, "U6.2Y")],
+    ids=["analog", "xy2-100"],
+)  # fmt: skip
+def test_two_outputs_on_one_net_break_the_rules(build_skidl, circuit, nets, freed):
+    wrong = change(circuit, **nets)._replace(unconnected=tuple(set(circuit.unconnected) - {freed}))
+    assert netlist.check_rules(build_skidl(wrong))[0] == 1
 
 
 # --- single faults ---
@@ -101,9 +96,16 @@ def test_two_outputs_on_one_net_break_the_rules(tmp_path, monkeypatch):
 def test_no_single_fault_leaves_the_laser_on_and_the_page_says_which_were_tried():
     require("ngspice")
     assert page.PAGE.read_text() == page.build_page(), "run python firmware_protocol/circuit/page.py"
-    assert page.DRAWING.read_text() == circuit.draw()
+    for circuit in CIRCUITS.values():
+        assert page.locate_drawing(circuit).read_text() == draw(circuit)
 
 
+def test_a_digital_circuit_needs_no_second_supply_converter_or_amplifier():
+    assert set(XY2_100.supplies) == {"5V", "3V3", "+12V"}
+    assert not {"U2", "U3"} & set(XY2_100.parts)
+
+
+@EACH
 @pytest.mark.parametrize(
     ("mutant", "exposed"),
     [
@@ -111,25 +113,38 @@ def test_no_single_fault_leaves_the_laser_on_and_the_page_says_which_were_tried(
         ("without R4", ["wire U1.GND (GND)", "wire X1.TTL (TTL)"]),
     ],
 )
-def test_a_circuit_that_lacks_a_part_leaves_it_on(monkeypatch, mutant, exposed):
+def test_a_circuit_that_lacks_a_part_leaves_it_on(circuit, mutant, exposed):
     require("ngspice")
-    if mutant == "without D3":
-        monkeypatch.delitem(circuit.PARTS, "D3")
-        monkeypatch.setitem(circuit.NETS, "GATE_5V", ["U1.1Y", "R2.1"])
-        monkeypatch.delitem(circuit.NETS, "GATE_HIGH")
-    else:
-        monkeypatch.delitem(circuit.PARTS, "R4")
-        for net in ("TTL", "GND"):
-            monkeypatch.setitem(circuit.NETS, net, [pin for pin in circuit.NETS[net] if not pin.startswith("R4.")])
-    assert [outcome.fault for outcome in faults.list_outcomes(("GND", "TTL")) if not outcome.is_dark] == exposed
+    lost = mutant.removeprefix("without ")
+    parts = {reference: part for reference, part in circuit.parts.items() if reference != lost}
+    nets = {net: [pin for pin in circuit.nets[net] if not pin.startswith(f"{lost}.")] for net in ("TTL", "GND")}
+    if lost == "D3":
+        nets |= {"GATE_5V": ["U1.1Y", "R2.1"], "GATE_HIGH": None}
+    outcomes = faults.list_outcomes(change(circuit, parts, **nets), ("GND", "TTL"))
+    assert [outcome.fault for outcome in outcomes if not outcome.is_dark] == exposed
+
+
+def test_a_lost_status_is_a_fault_also_of_an_unplugged_head():
+    require("ngspice")
+    unplugged = [f"X2.STATUS{sign}" for sign in "+-"]
+    nets = {net: [pin for pin in XY2_100.nets[net] if pin not in unplugged] for net in ("STATUS+", "STATUS-")}
+    (nothing, *cut) = [
+        each for each in faults.list_outcomes(change(XY2_100, **nets), ("STATUS",)) if "sup" not in each.fault
+    ]
+    assert (nothing.notice, nothing.reads["STATUS"] > 2.0) == ("FAULT HEAD", True)
+    assert {each.notice for each in cut} == {"FAULT HEAD"}
+    assert {each.notice for each in faults.list_outcomes(XY2_100, ("STATUS",)) if "wire" in each.fault} == {
+        "FAULT HEAD"
+    }
 
 
 # --- in time ---
 
 
+@EACH
 @pytest.mark.parametrize(("rise_s", "gate"), list(product((1e-5, 1e-3, 0.1), ("open", "low"))))
-def test_power_up_gives_the_laser_nothing(tmp_path, rise_s, gate):
-    deck = faults.build_deck(gate, rise_s=rise_s)
+def test_power_up_gives_the_laser_nothing(tmp_path, circuit, rise_s, gate):
+    deck = faults.build_deck(circuit, gate, rise_s=rise_s)
     found = simulate(deck, tmp_path, f"tran {rise_s / 100} {2 * rise_s} uic", "meas tran peak max v(ttl)")
     assert found["peak"] < 0.4
 
@@ -140,7 +155,7 @@ def test_the_readback_holds_through_a_pulse_and_ends_in_time(tmp_path, gate_hz, 
     source = f"pulse(0 3.3 1u {GATE_S} {GATE_S} {duty * period_s} {period_s} {pulses})"
     off_s = 1e-6 + (pulses - 1 + duty) * period_s
     found = simulate(
-        faults.build_deck(source), tmp_path, f"tran {min(period_s / 200, 2e-7)} {off_s + 2e-4}",
+        faults.build_deck(ANALOG, source), tmp_path, f"tran {min(period_s / 200, 2e-7)} {off_s + 2e-4}",
         f"meas tran lowest min v(held) from={off_s - 5 * period_s} to={off_s}",
         f"meas tran early when v(held)={SCHMITT_V[1]} fall=last",
         f"meas tran late when v(held)={SCHMITT_V[0]} fall=last",
@@ -151,14 +166,15 @@ def test_the_readback_holds_through_a_pulse_and_ends_in_time(tmp_path, gate_hz, 
     assert found["top"] > 3.0
 
 
-def test_no_part_carries_more_than_it_may():
+@EACH
+def test_no_part_carries_more_than_it_may(circuit):
     """AO3400A: 5.7 A; AHCT125: 8 mA an output; 0.25 W a resistor; relay and lamp on."""
     require("ngspice")
-    (volts,) = faults.run_ngspice([faults.build_deck("high")])
+    (volts,) = faults.run_ngspice([faults.build_deck(circuit, "high")])
     volts["0"] = 0.0
     assert 0.05 < volts["vcoil#branch"] < 0.06
     assert 0.0 < (volts["gate_high"] - volts["ttl"]) / 100.0 < 8e-3
-    for reference, part in circuit.PARTS.items():
+    for reference, part in circuit.parts.items():
         if reference.startswith("R"):
             ends = [volts[faults._spell(circuit.find_net(f"{reference}.{k}"))] for k in "12"]
             assert (ends[0] - ends[1]) ** 2 / faults._read_ohms(part.value.lower()) < 0.125, reference

@@ -23,11 +23,20 @@ def image(tmp_path_factory):
     return PicoImage(tmp_path_factory.mktemp("xy2-100"))
 
 
-@pytest.fixture
-def bench(image, tmp_path):
-    bench = Bench(VirtualKind("xy2-100", partial(EmulatedDigitalPico, image), make_board=PicoBoard), tmp_path)
+class ThoroughPico(EmulatedDigitalPico):
+    """A Pico every frame of which is played."""
+
+    plays_every_frame = True
+
+
+@pytest.fixture(params=[EmulatedDigitalPico])
+def bench(image, tmp_path, request):
+    bench = Bench(VirtualKind("xy2-100", partial(request.param, image), make_board=PicoBoard), tmp_path)
     yield bench
     bench.finish(lambda board: None)
+
+
+every_frame = pytest.mark.parametrize("bench", [ThoroughPico], ids=["every frame"], indirect=True)
 
 
 def draw_points(count, seed):
@@ -49,6 +58,7 @@ def check_places(core, points):
     assert sent == [place for place, _ in groupby([(32768, 32768), *(point[:2] for point in points)])]
 
 
+@every_frame
 def test_each_10_us_have_a_frame_with_the_position_of_the_points_even_when_the_core_has_stopped(bench):
     host = bench.ready(act("stop_tick"), settle_us=50, settle_ns_per_code=0, spot_leak_uw=4_000_000_000, **PATIENT)
     core, points = host.board.core, draw_points(500, 1)
@@ -79,7 +89,7 @@ def test_each_10_us_have_a_frame_with_the_position_of_the_points_even_when_the_c
     ids=["parity inverted", "control bits wrong", "frames dropped", "a bit short"],
 )
 def test_wrong_frames_are_detected(tmp_path, mutant, expected):
-    core = EmulatedDigitalPico(PicoImage(tmp_path, mutant), None, lambda entry: None, 1)
+    core = ThoroughPico(PicoImage(tmp_path, mutant), None, lambda entry: None, 1)
     core.advance(20_000)
     core.count_frames()
     assert expected <= {what for _, what in core.frame_errors}
@@ -162,6 +172,7 @@ def test_a_head_that_is_not_ready_turns_the_gate_off_within_200_us(bench, kind):
     print(f"gate off {off_us - since_us:.0f} µs after the status")
 
 
+@every_frame
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("piece", range(1, PIECES + 1), ids="minute-{}".format)

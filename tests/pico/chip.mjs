@@ -44,7 +44,7 @@ export class Chip {
       watchdog.timer.enable = false; // its alarm would fire again in the same instant
       onWatchdog();
     };
-    this.xy2 = new Xy2100(rp2040, this.clock, base, head, emit, (pin, high) => this.setPin(pin, high));
+    this.xy2 = new Xy2100(rp2040, this.clock, base, head, setup.everyFrame, emit, (pin, high) => this.setPin(pin, high));
     this.bend(rp2040);
     this.gateOpen = this.logged = this.stuck = this.loopStopped = this.tickStopped = false;
     this.level = {};

@@ -128,6 +128,8 @@ class EmulatedPico:
     """A Pico with its circuit. settings: None for those of the image. sink: receives each log event."""
 
     lease_until_us = 0
+    plays_every_frame = True
+    """Whether a frame of XY2-100 that is as the last one is played, too, and not only counted."""
     FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate", *ANSWERS)
 
     def __init__(self, image, settings, sink, seed=None):
@@ -145,6 +147,7 @@ class EmulatedPico:
         flash = image.with_settings(settings) if settings else image.flash
         setup = {"emulator": str(EMULATOR), "image": flash.hex(), "symbols": image.symbols, "offsets": image.offsets}
         setup |= {"seed": int.from_bytes(os.urandom(4)) if seed is None else seed + 1, "lateNanos": LATE_TICK_US * 1000}
+        setup["everyFrame"] = self.plays_every_frame
         with tempfile.NamedTemporaryFile("w", suffix=".json", delete=False) as file:
             json.dump(setup, file)
         self._process = subprocess.Popen(
@@ -338,6 +341,8 @@ class EmulatedPico:
 
 class EmulatedDigitalPico(EmulatedPico):
     """A Pico with a digital scan head, by XY2-100."""
+
+    plays_every_frame = False
 
     def __init__(self, image, settings, sink, seed=None):
         super().__init__(image, replace(settings or BoardSettings(), interface="xy2-100"), sink, seed)
