@@ -299,7 +299,7 @@ def test_the_queue_follows_the_board(monkeypatch, seed):
 
 def go_back_to_the_first(state, ended, light, at=0):
     """Mutant: the light of plans that end early is forgotten."""
-    return state._go_back(ended[0])._continue_from(at, state.end_s)
+    return state._go_back(ended[0])._continue_from(at, state.end_s, light)
 
 
 def rewind_the_last_plan_only(state, *arguments):

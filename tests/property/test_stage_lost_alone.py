@@ -260,7 +260,7 @@ MUTANTS = {
     "drawn twice": ("unplug", "frames", 0.2, queue_state, "find_emitted", forget_sent),
     "before the lost board is dark": ("unplug", "page", 0.03, BoardGroup, "is_draining", property(is_one_draining)),
     "a lease again": ("lie", "frames", 0.2, BoardGroup, "_readmit_lost", arm_again),
-    "not drawn": ("fault", "frames", 0.2, LinkService, "_interrupt_if_lost", lambda service: None),
+    "not drawn": ("fault", "frames", 0.2, LinkService, "_interrupt", lambda service, reason: None),
     "was lost": ("fault", "frames", 0.2, DisplayModel, "without_stage", lambda display, lost: display),
 }
 """What the judge says, with the loss, the requests, and what is replaced by a mutant."""

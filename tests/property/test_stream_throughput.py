@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
+from link_service_rig import CuttableLink, ServiceRig
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import plan_queue
 from optodrive.daemon.engine import planner as planner_module
@@ -47,7 +48,8 @@ class StreamRig(PlannerRig):
         config = load_config(NAME)
         settings = build_settings(build_port_settings(config).own_settings)
         requirements = build_board_requirements(config)
-        super().__init__(monkeypatch, display=DISPLAYS[NAME], requirements=requirements, settings=settings)
+        options = {"requirements": requirements, "settings": settings, "link_type": CuttableLink}
+        super().__init__(monkeypatch, display=DISPLAYS[NAME], **options)
         self.arrivals_s, self.records, self._planning_s = [], [], planning_s
         monkeypatch.setattr(planner_module, "make_plan", self._make_plan)
         self.ready().arm()
@@ -190,16 +192,19 @@ def test_a_stream_goes_on_after_the_host_has_stalled(monkeypatch, stall_s):
 
 
 def test_a_frame_whose_end_came_after_the_board_had_ended_the_job_is_drawn(monkeypatch):
-    """The link process hands over points and stalls before they leave. Mutant: it does not start the job again."""
-    for restart, is_drawn in ((PointStream.restart_if_ended, True), (lambda *arguments: None, False)):
+    """The line loses the points that move the END, until the board has ended. Mutant: the link does not notice."""
+    for find_sent_tick, is_drawn in ((PointStream.find_sent_tick, True), (lambda *arguments: None, False)):
         with monkeypatch.context() as patches:
-            patches.setattr(PointStream, "restart_if_ended", restart)
+            patches.setattr(PointStream, "find_sent_tick", find_sent_tick)
             rig = StreamRig(patches)
             rig.stream(choose_pixels(4), 100.0, 0.1)
             rig.stream(choose_pixels(4), 1000.0, STEP_S)  # handed over, and not yet sent
             assert rig.queue.state.running[-1].plan.plan_id == rig.records[-1].plan_id
-            rig.clock.sleep(0.06)
-            rig.run(0.5)
+            rig.link.is_cut = True
+            ServiceRig.run(rig, 0.06, STEP_S)
+            rig.link.is_cut = False
+            for _ in range(200):
+                rig.run()
             assert (rig.records[-1].status == "done") == is_drawn
             assert rig.session.board.underruns == 0
 

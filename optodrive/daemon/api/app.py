@@ -144,7 +144,7 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
 
     @routes("POST /v1/resume", "operator", tags=["board"], response_model=StateReport)
     async def resume() -> Response:
-        """Play the pulses left at the pause, limited again from the heat that is left, and the plans that wait."""
+        """Play the pulses left at the pause, planned anew for the heat that is left, and the plans that wait."""
         await daemon.link.command("resume")
         return _send_state(daemon)
 

@@ -149,11 +149,12 @@ class ActivePlan:
 
     @property
     def is_cut_short(self) -> bool:
-        """Whether the gate went off within an executed pulse."""
+        """Whether the gate went off within an executed pulse since the plan was interrupted last."""
         if self.executed is None or self.executed_rows is None:
             return False
-        planned_s = self.planned.plan.width_s[self.executed_rows]
-        return bool(np.any((self.executed.width_s > 0.0) & (self.executed.width_s < planned_s - CUT_MIN_S)))
+        planned_s, is_new = self.planned.plan.width_s[self.executed_rows], self.executed_rows >= self.first_row
+        is_cut = (self.executed.width_s > 0.0) & (self.executed.width_s < planned_s - CUT_MIN_S)
+        return bool(np.any(is_cut & is_new))
 
     @property
     def rest_count(self) -> int:
@@ -212,7 +213,6 @@ class ActivePlan:
 
     def add_executed(self, executed: ExecutedPulses, rows: IntArray) -> "ActivePlan":
         """Return the plan with the executed pulses that the board reports since the last interruption."""
-        executed = replace(executed, start_s=executed.start_s + self.zero_s)
         if self.executed is not None and self.executed_rows is not None:
             executed = concatenate_executed(self.executed, executed)
             rows = np.concatenate([self.executed_rows, rows])

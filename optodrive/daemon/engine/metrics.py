@@ -104,7 +104,8 @@ class PulseAccounts:
         record, start_s, session = plan.record, plan.planned.plan.start_s, self._session
         if job.executed_count < job.pulse_count:
             self.events.append(PlanProgress(run, job.executed_count, job.pulse_count))
-        plan = plan.add_executed(job.build_executed(plan.planned.plan, session.scales), job.list_executed_rows())
+        reported = job.build_executed(plan.planned.plan, session.scales, plan.zero_s)
+        plan = plan.add_executed(reported, job.list_executed_rows())
         changes: dict[str, Any] = {}
         if job.first_sent_tick is not None and record.first_byte_after_s is None:
             changes["first_byte_after_s"] = job.first_sent_tick * session.tick_s - record.arrived_s

@@ -55,6 +55,8 @@ SHARED_STREAM_LEAD_S = 0.04
 """Least lead of a stream if the link process has no real-time scheduling."""
 APPEND_LEAD_S = SPLICE_LEAD_S + 0.002
 """Least time between a plan and the end of the light that it follows if all of that has left."""
+COOLING_MAX_M = 2e-7
+"""A plan during whose delay a pixel's displacement decreases by more than this is planned anew, for the heat then."""
 GROWTH_MARGIN_S = 0.01
 """Time reserved for the loop and the hand-over of a plan's rest, besides its planning."""
 HOLD_MAX_S = 1.0
@@ -173,11 +175,11 @@ class PlanQueue:
         leave_s, begin_s = planned_s + self.lead_s, planned_s + STREAM_START_LEAD_S
         return build_cut_snapshot(running, thermal, leave_s, self._budget, self._session.tick_s, min_end_s, begin_s)
 
-    def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot, cooling_max_m: float = inf) -> PlanRecord | None:
+    def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot) -> PlanRecord | None:
         """Accept a plan into the queue, and return its record. Return None if its snapshot is stale, or it is too late.
 
         A plan is too late if its cut has passed, or if it would start so much later than planned that a pixel's
-        displacement meanwhile decreases by more than cooling_max_m, m.
+        displacement meanwhile decreases by more than COOLING_MAX_M.
         Raise StoppedError if the epoch of its request has passed, or if the token of its caller was revoked.
         """
         self._session.connection.receive()  # a STOP that has been answered is known from here on
@@ -200,7 +202,7 @@ class PlanQueue:
             start_s = max(record.start_s, self._earliest_start_s(state, record.streamed))
             if start_s > record.start_s:
                 # Later is safe for the skin, but a bump from less heat is lower.
-                if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > cooling_max_m:
+                if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > COOLING_MAX_M:
                     return None
                 plan = plan.rebase(start_s, snapshot.thermal.shift(-start_s))
             self._apply(state.accept(plan))
@@ -255,31 +257,35 @@ class PlanQueue:
     def start_next(self) -> None:
         """Start the next plan if the board is ready for it.
 
-        Several boards emit nothing late: a plan whose time has passed while it waited for them is proven again for now.
+        One whose time has passed meanwhile starts later, or is planned anew if its pixels cool.
         """
         state, now_s = self.state, self._session.board_s()
         # One job at a time; a stream's next plan goes on in the running job, and does not pass here.
         if state.running or not state.waiting or not self._session.is_ready or state.off_s is not None:
             return
         plan = state.waiting[0]
-        if len(self._session.scales) > 1 and plan.points_start_s < now_s:
-            self._apply(state.hold(now_s))
-        elif not plan.rest_count:
-            self._apply(state.begin(None))
-        else:
+        if plan.points_start_s < now_s:
+            delay_s = now_s + START_LEAD_S - plan.points_start_s
+            # The heat before a rest is not that before its plan.
+            if plan.first_row or plan.before.compute_cooling_m(0.0, delay_s) > COOLING_MAX_M:
+                self._apply(state.hold(now_s))
+                return
+            state = state.delay(delay_s)
+            plan = state.waiting[0]
+        job = None
+        if plan.rest_count:
             ahead_s = self.lead_s if plan.record.streamed else inf
-            self._apply(
-                state.begin(self._session.begin(plan.points, plan.points_start_s, plan.epoch, ahead_s, plan.crc))
-            )
+            job = self._session.begin(plan.points, plan.points_start_s, plan.epoch, ahead_s, plan.crc)
+        self._apply(state.begin(job))
 
     def update_jobs(self, refusal: str | None) -> None:
         """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""
         # First: a board that is not armed executes nothing of what runs.
         if self._session.board.state in UNARMED_STATES and self.is_busy:
             self.end_all(PlanStatus.FAILED, self._describe_unarmed())
-        off_s = self._session.pop_drained()
-        if off_s is not None:
-            self._apply(self._collect().interrupt(off_s, self._session.lost, self._find_light_end()))
+        drained = self._session.pop_drained()
+        if drained is not None:
+            self._apply(self._collect().interrupt(*drained, self._session.lost, self._find_light_end()))
         if self.state.off_s is not None and not self.state.waiting and not self.is_held:
             self._apply(self.state.hold(None))
         self._apply(self.state.update_runs([self.accounts.read_progress(run) for run in self.state.running]))
@@ -307,7 +313,7 @@ class PlanQueue:
         if any(run.plan.plan_id == record.plan_id for run in state.running):
             self._session.flush()
             state = self._collect()
-        self._apply(state.cancel(record.plan_id, reason, self._find_light_end(), self._session.board_s()))
+        self._apply(state.cancel(record.plan_id, reason, self._find_light_end()))
 
     def end_all(self, status: PlanStatus, reason: str, clock_shift_s: float = 0.0) -> None:
         """End all running and waiting plans.
@@ -343,21 +349,21 @@ class PlanQueue:
         return self._session.pause_ends_in_s
 
     def require_no_pause(self) -> None:
-        """Raise NotReadyError while the light is paused. An interruption by a lost stage is over in a moment."""
+        """Raise NotReadyError while the light is paused. An interruption is over in a moment."""
         self._session.connection.receive()
         if self.is_held and not self._session.is_interrupted:
             raise NotReadyError("the light is paused, and a streamed frame shows the present; resume first")
 
     @property
     def can_restart(self) -> bool:
-        """Whether waiting plans are to be limited and proven again now. Any thread may read it."""
+        """Whether waiting plans are to be planned anew now. Any thread may read it."""
         state = self.state
         return state.off_s is not None and bool(state.waiting) and not state.running and not self.is_held
 
     def build_restart(
         self, display: DisplayModel, planning_time_s: float, on_progress: Callable[[], None]
     ) -> Restart | None:
-        """Limit and prove the waiting plans again, in any thread. Return None if none is to be restarted.
+        """Plan the waiting plans anew, in any thread. Return None if none is to be restarted.
 
         planning_time_s: time that is reserved for this. Raise LocalProtocolError if one exceeds a cap.
         """
@@ -368,12 +374,15 @@ class PlanQueue:
         return restart_plans(display, self._session.scales, state.waiting, start_s, START_LEAD_S, on_progress)
 
     def commit_restart(self, restart: Restart) -> bool:
-        """Let the queue go on. Return False if the queue has changed meanwhile, or the light is paused again."""
+        """Let the queue go on. Return False if the queue has changed meanwhile, or it is too late, as for `commit`."""
         self._session.connection.receive()  # a STOP or a pause that has been answered is known from here on
-        # A plan is another value after each change of the heat before it; what a further pause took is a delay.
+        # A plan is another value after each change of the heat before it.
         if not self.can_restart or self.state.waiting != restart.plans:
             return False
-        delay_s = max(0.0, self._session.board_s() + START_LEAD_S - restart.start_s)
+        start_s = restart.start_s
+        delay_s = max(0.0, self._session.board_s() + START_LEAD_S - start_s)
+        if delay_s and restart.before.compute_cooling_m(start_s, start_s + delay_s) > COOLING_MAX_M:
+            return False
         self._apply(self.state.resume(restart, delay_s))
         return True
 

@@ -1,16 +1,16 @@
 """Heat and rest of plans that ended early or were interrupted.
 
 An estimate may be too warm (a pulse that was cut short), never too cold: heat is taken back only by computing it again
-from the executed pulses (`rewind_estimate`). What a plan has left after a pause, a cancelled plan before it or the loss
-of a stage is limited and proven again for the time at which the light returns (decision 37). Without all the stages for
-which it was made it is planned anew (decision 49). `ThermalMemory` keeps in shared memory what a later planner process
-continues from.
+from the executed pulses (`rewind_estimate`). What a plan has left after a pause, a cancelled plan before it, the loss
+of a stage or light that would have been late is planned anew for the heat at which the light returns, limited and
+proven again (decision 37). `ThermalMemory` keeps in shared memory what a later planner process continues from.
 """
 
 import mmap
 import pickle
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from math import inf
 from typing import NamedTuple, Self
@@ -18,8 +18,10 @@ from uuid import uuid4
 
 import numpy as np
 
+from optodrive.core.errors import RefusedError
 from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses, LimitedPlan, PulsePlan
+from optodrive.core.types.push_options import Policy
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame, Train
 from optodrive.daemon.engine.active_plan import ActivePlan, PlanRows, ThermalEstimate
 from optodrive.link.protocol.quantisation import WireScale
@@ -29,7 +31,7 @@ from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import commit_until
-from optodrive.planning.limiter.rest import limit_rest, replace_rest
+from optodrive.planning.limiter.rest import replace_rest
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.planned_sequence import PlannedSequence
@@ -192,13 +194,15 @@ def _build_train(planned: PlannedSequence, source: int, first_row: int, origin_s
 class Restart(NamedTuple):
     """Plans in their order before and after they were made again.
 
-    start_s: board time at which the first one's points begin; end_s: of the last pulse; after: heat and budget then
+    start_s: board time at which the first one's points begin; end_s: of the last pulse
+    before, after: heat and budget before and after all, in board time
     """
 
     plans: tuple[ActivePlan, ...]
     restarted: tuple[ActivePlan, ...]
     start_s: float
     end_s: float
+    before: ThermalEstimate
     after: ThermalEstimate
 
 
@@ -210,19 +214,19 @@ def restart_plans(
     gap_s: float,
     on_progress: Callable[[], None],
 ) -> Restart:
-    """Limit and prove plans that follow each other.
+    """Plan, limit and prove plans that follow each other again.
 
     start_s: board time at which the first one begins, once the light before it is over; gap_s: between two plans
     Raise LocalProtocolError if the bytes of one exceed a cap, and what on_progress raises.
     """
     restarted: list[ActivePlan] = []
-    estimate = estimate_before_rest(plans[0], display.budget, on_progress)
+    before = estimate = estimate_before_rest(plans[0], display.budget, on_progress)
     start_s = end_s = max(start_s, estimate.budget.at_s)
     for plan in plans:
         begin_s = start_s if not restarted else max(end_s + gap_s, estimate.budget.at_s)
         again, estimate, end_s = _restart(display, scales, plan, estimate, begin_s, on_progress)
         restarted.append(again)
-    return Restart(plans, tuple(restarted), start_s, end_s, estimate)
+    return Restart(plans, tuple(restarted), start_s, end_s, before, estimate)
 
 
 def _restart(
@@ -242,15 +246,10 @@ def _restart(
         plan.growth.on_progress = lambda _: on_progress()
         planned = plan.growth.plan_until()
     before = before.shift(-start_s)
-    budget = before.budget
-    is_made_for_all = display.draws.all() or (first and _is_made_for(display, plan))
-    if is_made_for_all and (first or planned.delays):  # under "delay" its pulses have the times that caps allowed them
-        rest, budget_after = limit_rest(planned.plan, first, -_find_origin_s(plan), budget, display.budget, on_progress)
-    else:
-        rest, budget_after = _plan_anew(display, plan, before, on_progress)
+    rest, budget_after = _plan_anew(display, plan, before, on_progress)
     points = StagePoints.from_plan(rest, scales, display.draws)
     on_progress()
-    proven = prove(rest, points, scales, budget, display.budget, on_progress)
+    proven = prove(rest, points, scales, before.budget, display.budget, on_progress)
     heat = before.heat.copy()
     peaks = heat.apply_pulses(rest.pixel, rest.start_s, rest.width_s, rest.power_w, on_progress)
     after = ThermalEstimate(heat, budget_after).shift(start_s)
@@ -276,36 +275,34 @@ def _restart(
     return restarted, after, start_s + rest.end_s
 
 
-def _is_made_for(display: DisplayModel, plan: ActivePlan) -> bool:
-    """Return whether a plan was made for the stages that draw: a lost one has no points."""
-    return all(drawing or not len(points) for drawing, points in zip(display.draws, plan.points.stages, strict=True))
-
-
 def _plan_anew(
     display: DisplayModel,
     plan: ActivePlan,
     before: ThermalEstimate,
     on_progress: Callable[[], None],
 ) -> tuple[LimitedPlan, BudgetState]:
-    """Plan the rest of a plan for the present stages. Return its rows and the state after them.
+    """Plan the rest of a plan for the heat before it and the present stages. Return its rows and the state after them.
 
-    Pulses above a cap are trimmed, as after a pause, under each policy of the request.
+    Pulses above a cap are delayed if caps delayed the plan before, and trimmed under each other policy of the request.
     """
     sequence, sources = build_rest_sequence(plan.planned, plan.first_row, plan.origin_s)
-    anew = plan_sequence(display, sequence, before.heat, before.budget, "trim", lambda _: on_progress())
-    return replace(anew.plan, source=sources[anew.plan.source]), anew.budget
+    policies: tuple[Policy, ...] = ("delay", "trim") if plan.planned.delays else ("trim",)
+    for policy in policies:
+        with suppress(RefusedError):  # of a pulse that never fits, as on a display that was dimmed
+            anew = plan_sequence(display, sequence, before.heat, before.budget, policy, lambda _: on_progress())
+            break
+    # As the plan's own rows state them: a later pause finds the cycles that are left by that.
+    parts, whole = ((*each.frames, *each.trains) for each in (sequence, plan.planned.sequence))
+    shifts_s = [_find_mark_s(whole[at]) - _find_mark_s(part) for part, at in zip(parts, sources, strict=True)]
+    requested_s = anew.plan.requested_start_s + plan.planned.lead_in_s - anew.lead_in_s
+    if len(anew.plan):
+        requested_s = requested_s + np.array(shifts_s)[anew.plan.source]
+    return replace(anew.plan, source=sources[anew.plan.source], requested_start_s=requested_s), anew.budget
 
 
-def _find_origin_s(plan: ActivePlan) -> float:
-    """Return the time of the plan at which its points begin again: when the light went off, or shortly before a pulse.
-
-    The mirrors need the lead-in before the first pulse.
-    """
-    start_s = plan.planned.plan.start_s
-    if plan.first_row >= len(start_s):
-        return plan.origin_s
-    latest_s = float(start_s[plan.first_row]) - plan.planned.lead_in_s
-    return float(np.floor(min(plan.origin_s, latest_s) * 1e6) * 1e-6)
+def _find_mark_s(request: TactileFrame | Train) -> float:
+    """Return a time that a request and its rest have in common: when a frame is shown, or when a train ends."""
+    return request.show_at_s if isinstance(request, TactileFrame) else request.start_s + request.duration_s
 
 
 def _summarize_again(planned: PlannedSequence, before_json: bytes) -> bytes:

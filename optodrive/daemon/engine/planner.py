@@ -68,10 +68,6 @@ STALL_TIMEOUT_S = 2.0
 """A planner without progress for this time counts as stalled, and the lease is no longer renewed."""
 SPLICE_TRIES = 2
 """Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
-COOLING_MAX_M = 2e-7
-"""A plan during whose delay a pixel's displacement decreases by more than this is made again, for the heat then."""
-LATE_MAX = 4
-"""Number of late attempts after which a plan starts as soon as it is ready."""
 PLANNING_MAX_S = 60.0
 """Processor time for the planning of one request at most, s; meanwhile all others wait."""
 REALTIME_MAX_S = 0.1
@@ -118,7 +114,7 @@ class Planner:
         self._ids = count(1)
         self._pending_count = 0
         self._progress_at_s = clock.now_s()
-        self._planning_time, self._restart_time, self._growth_time = PlanningTime(), PlanningTime(), PlanningTime()
+        self._planning_time, self._growth_time = PlanningTime(), PlanningTime()
         self._horizon = StreamHorizon()
         self._own_work: Future[None] | None = None
 
@@ -232,28 +228,28 @@ class Planner:
         self._plan_until_committed(built, PlanningRequest(lambda: built, push, record.arrived_s), check)
 
     def _restart(self) -> None:
-        """Limit and prove the waiting plans again, until that holds or the light is paused or stopped again."""
+        """Plan the waiting plans anew, until they are in time or the light is paused or stopped again."""
 
         def on_progress() -> None:
             self._progress_at_s = self._clock.now_s()
 
         try:
-            while not self._restart_once(on_progress):
-                pass
+            began_s, reserved_s = self._clock.now_s(), 0.0
+            while not self._restart_once(on_progress, reserved_s):
+                # All attempts together: each reserves more.
+                reserved_s = FACTOR * (self._clock.now_s() - began_s)
         except Exception as error:  # of any kind: what cannot be proven is not played
             self._fail_all(f"what was left after an interruption could not be planned again: {error}")
         finally:
             on_progress()
 
-    def _restart_once(self, on_progress: Callable[[], None]) -> bool:
-        """Restart once. Return False if the queue was changed, or the display was dimmed, meanwhile."""
-        began_s, display = self._clock.now_s(), self._dimmer.display
+    def _restart_once(self, on_progress: Callable[[], None], reserved_s: float) -> bool:
+        """Restart once. Return False if it is late, the queue was changed, or the display was dimmed, meanwhile."""
+        display = self._dimmer.display
         on_progress()
-        reserved_s = self._restart_time.compute_reserved_s(0)
         restart = self._plan_queue.build_restart(display, reserved_s, on_progress)
         if restart is None:
             return True
-        self._restart_time.record(self._clock.now_s() - began_s)
 
         def commit() -> bool:
             return self._dimmer.display is display and self._plan_queue.commit_restart(restart)
@@ -324,7 +320,7 @@ class Planner:
                 self._run_in_loop(lambda: self._preempt(request))
             began_s = self._clock.now_s()
             reserved_s = self._compute_reserved_s(request, late_count, took_s)
-            record = self._plan_once(built, request, plan_id, late_count, reserved_s, horizon_s, check)
+            record = self._plan_once(built, request, plan_id, reserved_s, horizon_s, check)
             if record is not None:
                 return record
             took_s = self._clock.now_s() - began_s
@@ -349,14 +345,12 @@ class Planner:
         built: BuiltRequest,
         request: PlanningRequest,
         plan_id: str,
-        late_count: int,
         reserved_s: float,
         horizon_s: float,
         check: Callable[[float], None],
     ) -> PlanRecord | None:
         """Plan once. Return None if the plan is late, the snapshot stale, or the display was dimmed meanwhile."""
         began_s, display = self._clock.now_s(), self._dimmer.display
-        cooling_max_m = COOLING_MAX_M if late_count < LATE_MAX else inf
         snapshot = self._plan_queue.make_snapshot(request.push.streamed, reserved_s)
         plan = make_plan(display, self._session.scales, request, built, snapshot, plan_id, check, horizon_s)
         if request.push.streamed:
@@ -364,6 +358,6 @@ class Planner:
 
         def commit() -> PlanRecord | None:
             is_as_dim = self._dimmer.display is display
-            return self._plan_queue.commit(plan, snapshot, cooling_max_m) if is_as_dim else None
+            return self._plan_queue.commit(plan, snapshot) if is_as_dim else None
 
         return self._run_in_loop(commit)

@@ -18,14 +18,15 @@ plans that wait. Plans run in the order of acceptance. What has left for the boa
 the gate off, which ends all running plans. Every pulse is counted exactly once: as executed, dropped, or left in the
 plan that waits for its rest.
 
-Lateness. A plan may start later than it was planned for, because the heat that it relied on can only have decayed; all
-plans behind it are then delayed by as much. Behind a cancelled one a plan is made again, for colder pixels.
+Widths. A pulse's width is that for the heat at its start. A plan may start later than it was planned for only by a time
+in which nothing cools noticeably; all plans behind it are then delayed by as much. After anything else that changes the
+heat before it, a plan that waits is planned anew (`off_s`).
 
-Pauses. The board drops its queue; what was not executed becomes the rest of the same plan, which waits at the front and
-is limited again for the time at which the light returns (decision 37). A stream is dropped, as it shows the present.
-The loss of a stage, where the others go on, interrupts as a pause does. Nobody knows what the lost board emitted: what
-it was sent for the time before it was dark for certain counts, and is not repeated. What is left is planned anew, also
-that of a stream, unless a newer frame waits already (decision 49).
+Interruptions. In a pause the board drops its queue; what was not executed becomes the rest of the same plan, which
+waits at the front and is planned anew for the time at which the light returns (decision 37). A stream is dropped, as it
+shows the present. Points that would be late, and the loss of a stage where the others go on, interrupt as a pause does;
+of a stream the rest is then drawn, unless a newer frame waits already. Nobody knows what a lost board emitted: what it
+was sent for the time before it was dark for certain counts, and is not repeated (decision 49).
 """
 
 from collections.abc import Callable, Sequence
@@ -98,7 +99,7 @@ class QueueState:
     budget, on_progress: of the display, and called during long computations; the same in all states of a queue
     thermal: after all plans, in board time; end_s: board time at which the last one ends
     running: with their jobs, each continued by the next; waiting: in their order
-    off_s: board time at which the light went off, None unless the waiting plans are to be made again first
+    off_s: board time at which the light went off, None unless the waiting plans are to be planned anew first
     last: plan that ended last if it was streamed; is_unfinished: whether its rest is due, as no newer plan came
     ended: plans that left the queue with the last transition
     """
@@ -203,7 +204,7 @@ class QueueState:
         plans = self.waiting
         if not plans:
             return self
-        state = replace(self, waiting=())._go_back(plans[0])
+        state = replace(self, waiting=(), off_s=None)._go_back(plans[0])
         plans = tuple(plan.note(dropped=plan.rest_count) for plan in plans)
         return state._end(plans, PlanStatus.SUPERSEDED, REPLACED)
 
@@ -251,11 +252,8 @@ class QueueState:
         plan = plan.note(dropped=plan.rest_count - sent)
         return replace(self, running=(PlanRun(plan, job), *others)).end_running(PlanStatus.SUPERSEDED, REPLACED, light)
 
-    def cancel(self, plan_id: str, error: str, light: LightEnd, off_s: float) -> "QueueState":
-        """Remove a waiting plan, or end the running ones if it is among them. Others have no such plan.
-
-        Those behind it are made again, because their pulses are for warmer pixels. off_s: board time now
-        """
+    def cancel(self, plan_id: str, error: str, light: LightEnd) -> "QueueState":
+        """Remove a waiting plan, or end the running ones if it is among them. Others have no such plan."""
         ids = [plan.plan_id for plan in self.waiting]
         if plan_id in ids:
             at = ids.index(plan_id)
@@ -264,13 +262,11 @@ class QueueState:
             if plan.is_interrupted:
                 state = state._rewind([plan], light, at)
             else:
-                state = state._go_back(plan)._continue_from(at, end_s)
-            state = state._end([plan], PlanStatus.CANCELLED, error or "removed from the queue")
-        elif any(run.plan.plan_id == plan_id for run in self.running):
-            state = self.end_running(PlanStatus.CANCELLED, error or "cancelled while running", light)
-        else:
-            return self
-        return replace(state, off_s=off_s) if state.waiting else state
+                state = state._go_back(plan)._continue_from(at, end_s, light)
+            return state._end([plan], PlanStatus.CANCELLED, error or "removed from the queue")
+        if any(run.plan.plan_id == plan_id for run in self.running):
+            return self.end_running(PlanStatus.CANCELLED, error or "cancelled while running", light)
+        return self
 
     # --- pauses and lost stages ---------------------------------------------------------------------------------
 
@@ -281,26 +277,26 @@ class QueueState:
         """
         return replace(self, off_s=off_s)
 
-    def interrupt(self, off_s: float, lost: LostStage | None, light: LightEnd) -> "QueueState":
+    def interrupt(self, off_s: float, reason: str, lost: LostStage | None, light: LightEnd) -> "QueueState":
         """Let the plans that ran wait for the rest of their pulses. Their reports are collected.
 
-        off_s: board time at which the light went off; lost: the stage whose loss did it, None for a pause
+        off_s: board time at which the light went off; reason: for people, '' for a pause; lost: the stage that was lost
         """
         state, ended = replace(self, off_s=off_s), []
         while state.running:
             run, state = state.running[0], replace(state, running=state.running[1:])
             plan = run.plan
             if lost is not None and len(plan.points.stages[lost.stage]):
-                plan, error = _interrupt_by_loss(run, lost, off_s), REPLACED
-                is_over = bool(state.running) or any(each.record.streamed for each in state.waiting)
-            else:
-                error, is_over = PAUSED, plan.record.streamed
+                plan = _interrupt_by_loss(run, lost, off_s)
+            is_followed = bool(state.running) or any(each.record.streamed for each in state.waiting)
+            # The next refresh of a page knows better what is due now.
+            is_over = is_followed or plan.record.refreshes if reason else plan.record.streamed
             left = plan.left_count
             if is_over or not left:
                 is_partial = left or plan.growth is not None
                 plan = plan.note(dropped=left)
                 status = PlanStatus.SUPERSEDED if is_partial else PlanStatus.DONE
-                state = state._end([plan], status, error if is_partial else None)
+                state = state._end([plan], status, (reason or PAUSED) if is_partial else None)
                 ended.append(plan)
             elif plan.is_interrupted:
                 state = replace(state, waiting=(plan, *state.waiting))
@@ -375,12 +371,12 @@ class QueueState:
         """
         plans, (dark_s, gate_off_s) = EndedPlans.from_plans(ended), light
         estimate = rewind_estimate(plans, gate_off_s, self.budget, self.on_progress, dark_s)
-        return self._count(estimate, max(gate_off_s, estimate.budget.at_s))._continue_from(at, self.end_s)
+        return self._count(estimate, max(gate_off_s, estimate.budget.at_s))._continue_from(at, self.end_s, light)
 
-    def _continue_from(self, at: int, end_s: float) -> "QueueState":
+    def _continue_from(self, at: int, end_s: float, light: LightEnd) -> "QueueState":
         """Let the plans that wait begin from the present estimate, each from that after the one before it.
 
-        at: index of the first one; end_s: end of the last one
+        They are planned anew before they begin. at: index of the first one; end_s: end of the last one
         """
         waiting, thermal = list(self.waiting), self.thermal
         for number, plan in enumerate(waiting[at:], at):
@@ -389,7 +385,10 @@ class QueueState:
             plan = waiting[number] = plan.rebase(start_s, before)
             budget = commit_until(plan.planned.plan, inf, before.budget, self.budget, self.on_progress)
             thermal = ThermalEstimate(plan.planned.heat, budget).shift(start_s)
-        return self._count(thermal, end_s, waiting=tuple(waiting)) if waiting[at:] else self
+        if not waiting[at:]:
+            return self
+        off_s = light.dark_s if self.off_s is None else self.off_s
+        return self._count(thermal, end_s, waiting=tuple(waiting), off_s=off_s)
 
 
 def _interrupt_by_loss(run: PlanRun, lost: LostStage, off_s: float) -> ActivePlan:

@@ -68,7 +68,7 @@ class ExecutedBatch(NamedTuple):
         active, job = progress.run
         plan, reported = active.planned.plan, job.read_reported(progress.begin, progress.end, scales)
         row, tick_s = reported.row, scales[0].tick_s
-        on_tick = job.find_begin_tick(reported, plan, tick_s)
+        on_tick = job.find_begin_tick(reported, plan, tick_s, active.zero_s)
         pulses = EmittedPulses(
             pixel=plan.pixel[row],
             start_s=np.asarray(on_tick * tick_s, dtype=np.float64),

@@ -2,7 +2,7 @@
 
 Clients have roles, one caller has control of the board, epochs lie between two stops, and a pause keeps the board armed
 with the gate off, while the queue waits in the planner. An interruption is a pause that nobody has requested: a stage
-was lost.
+was lost, or light would have been late.
 """
 
 from collections.abc import Iterator
@@ -101,12 +101,13 @@ NO_PAUSE = PauseStatus()
 class Pauses:
     """Pauses of the light since this process started.
 
-    number: of the latest one; began_s: board time of its begin
+    number: of the latest one; began_s: board time of its begin; reason: for people, '' if it was requested
     """
 
     def __init__(self, clock: Clock) -> None:
         self.number = 0
         self.began_s = 0.0
+        self.reason = ""
         self._clock = clock
         self._since_s: float | None = None
 
@@ -127,14 +128,13 @@ class Pauses:
 
     def begin(self, board_s: float) -> None:
         """Begin a pause at a board time, s."""
-        self.number += 1
-        self.began_s = board_s
+        self.interrupt(board_s, "")
         self._since_s = self._clock.now_s()
 
-    def interrupt(self, board_s: float) -> None:
+    def interrupt(self, board_s: float, reason: str) -> None:
         """Begin an interruption at a board time, s: a pause that ends when all is reported that was executed."""
         self.number += 1
-        self.began_s = board_s
+        self.began_s, self.reason = board_s, reason
 
     def end(self) -> None:
         """End the pause, if there is one."""

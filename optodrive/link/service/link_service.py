@@ -19,8 +19,9 @@ the web process, because a shell or the key can still stop it; then `UNATTENDED_
 Control. Who armed the board controls it: an arming may be held by a client that must prove its presence (hold-to-run),
 and ends with it. One arming at a time; a second caller is told who arms.
 
-Pauses are numbered and held here, as STOP is, so that they take effect however busy the planner is (decision 37). The
-loss of a stage, where the others go on, is an interruption of the same kind that ends by itself (decision 49).
+Pauses are numbered and held here, as STOP is, so that they take effect however busy the planner is (decision 37).
+Points that would be late, and the loss of a stage where the others go on (decision 49), are interruptions of the same
+kind that end by themselves.
 
 Order of one `step`: bytes of the board first, then what follows from them (ends of epochs), then status, then the
 answers to commands: a caller that learns from an answer that the board is armed may push at once, and the planner must
@@ -297,8 +298,11 @@ class LinkService:
     def _step_session(self, wait_s: float) -> None:
         stalled = self._clients.find_stalled()
         try:
+            # Before the sessions send: a point that is late on one board must not leave on another.
+            self._interrupt(self._boards.describe_lateness())
             self._boards.step(wait_s, renew_lease=not stalled, stalled=stalled)
-            self._interrupt_if_lost()
+            # The others are dark until the lost one is so for certain.
+            self._interrupt(self._boards.pop_loss())
             # The order of these follows the causes: a lost stage is an interruption, and only what is not one ends the
             # epoch.
             self._watch_board()
@@ -310,10 +314,10 @@ class LinkService:
             # light.
             self._end_epoch(f"the link to the board was lost: {self._describe_link_error()}")
 
-    def _interrupt_if_lost(self) -> None:
-        """Turn the light of the others off when one was lost alone, until that one is dark for certain."""
-        if self._boards.pop_loss():
-            self.pauses.interrupt(self._boards.board_s())
+    def _interrupt(self, reason: str) -> None:
+        """Turn the light off until all is reported that was executed, if there is a reason."""
+        if reason:
+            self.pauses.interrupt(self._boards.board_s(), reason)
             self._handover.pause()
 
     def _watch_board(self) -> None:

@@ -132,7 +132,8 @@ class PointHandover:
             # Reports first, then `drained`: the planner takes all that was lit as known from then on.
             self._report_jobs()
             self.clear()
-            self._send(Message("drained", {"pause": self._pauses.number, "board_s": self._pauses.began_s}))
+            fields = {"pause": self._pauses.number, "board_s": self._pauses.began_s, "reason": self._pauses.reason}
+            self._send(Message("drained", fields))
 
     def carry_out(self, message: Message) -> None:
         """Carry out a command of the planner. Raise KeyError, TypeError or ValueError if it is malformed."""

@@ -91,7 +91,7 @@ class RemoteSession(LinkStatus):
         self.connection.on_message, self.connection.on_lost = self._on_message, self._on_lost
         self._beaten_s = -inf
         self._commands_sent = self._drained_number = self._job_number = 0
-        self._drained_s: float | None = None
+        self._drained: tuple[float, str] | None = None
         self._refusal: str | None = None
         self._jobs: dict[int, RemoteJob] = {}
 
@@ -114,7 +114,7 @@ class RemoteSession(LinkStatus):
             if status.epoch != self.epoch:
                 # Another epoch: link has forgotten all jobs, and none of their reports will come.
                 self._jobs.clear()
-                self._drained_number, self._drained_s = status.pause.number, None
+                self._drained_number, self._drained = status.pause.number, None
             self._take_status(status)
         elif message.kind == "executed":
             job = self._jobs.get(fields["job"])
@@ -127,7 +127,7 @@ class RemoteSession(LinkStatus):
             if not fields["paused"]:  # else the planner hands the plan over again, see pop_drained()
                 self._keep_refusal(fields["reason"])
         elif message.kind == "drained":
-            self._on_drained(fields["pause"], fields["board_s"])
+            self._on_drained(fields["pause"], fields["board_s"], fields["reason"])
         elif message.kind == "refusal":
             self._keep_refusal(fields["reason"])
 
@@ -143,12 +143,12 @@ class RemoteSession(LinkStatus):
         if fields["finished"]:
             del self._jobs[fields["job"]]
 
-    def _on_drained(self, number: int, board_s: float) -> None:
+    def _on_drained(self, number: int, board_s: float, reason: str) -> None:
         self._jobs.clear()
         # The latest only: points carry it, and link refuses those that know an older pause.
         self._drained_number = number
-        if self._drained_s is None:
-            self._drained_s = board_s
+        if self._drained is None:
+            self._drained = board_s, reason
 
     # --- state ------------------------------------------------------------------------------------------------------
 
@@ -166,16 +166,17 @@ class RemoteSession(LinkStatus):
 
     @property
     def is_interrupted(self) -> bool:
-        """Whether the light is held because a stage was lost, and not by a pause."""
-        return self.is_held and self.pause_ends_in_s is None and self.lost is not None
+        """Whether the light is held only until all is reported that was executed."""
+        return self.is_held and self.pause_ends_in_s is None
 
-    def pop_drained(self) -> float | None:
-        """Return and clear the board time at which a pause began, s, when all is reported that was executed before it.
+    def pop_drained(self) -> tuple[float, str] | None:
+        """Return and clear when a pause began, board time, s, and why, once all is reported that was executed by then.
 
-        The link process has dropped all jobs; it refuses points that were handed over before.
+        The reason is '' of a requested pause. The link process has dropped all jobs; it refuses points that were handed
+        over before.
         """
-        drained_s, self._drained_s = self._drained_s, None
-        return drained_s
+        drained, self._drained = self._drained, None
+        return drained
 
     def pop_refusal(self) -> str | None:
         """Return and clear the reason for which link process or board refused a command."""

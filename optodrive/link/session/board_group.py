@@ -17,11 +17,11 @@ answers again, because its arming has ended. Everything here then speaks of the 
 for it while its link is up. The owner pauses them until it is dark for certain (`LostStage.dark_s`). A second loss ends
 the light of all. It counts as lost until all are disarmed.
 
-Time. One board keeps its own: `board_s` is its clock, its points follow each other by durations, and what is late is
-executed late and reported. Several keep the host's (`staged_job.py`): `board_s` is the host's clock.
+Time. One board keeps its own: `board_s` is its clock, and its points follow each other by durations. Several keep the
+host's (`staged_job.py`): `board_s` is the host's clock.
 
-Late light is not emitted. If one board would execute its next point late, all drop their points and stay armed
-(`_drop_late_points`), and the plan has failed: light out of order is not covered by any proof.
+Late light is not emitted. If a board would execute its next point late (`describe_lateness`), the owner drains all: its
+width is for heat that has decayed, and light out of order is not covered by any proof.
 
 Streams are cut at one time on all boards, behind every point that may have left; a splice is made on all or, if it is
 too late on one, on none.
@@ -61,8 +61,7 @@ class BoardGroup(GroupState):
     ) -> None:
         super().__init__(sessions, clock, open_ports, names, skew_max_s)
         self._on_stage_loss = on_stage_loss
-        self._were_armed = self._is_loss_new = False
-        self._refusal: str | None = None
+        self._were_armed, self._new_loss = False, ""
         self.on_executed: Callable[[int, m.Executed], None] = lambda stage, message: None
         for stage, session in enumerate(self.sessions):
             session.on_executed = partial(self._forward_executed, stage)
@@ -97,8 +96,6 @@ class BoardGroup(GroupState):
         """
         # First: a board that has come back takes part from this turn on, or the next arming would miss it.
         self._readmit_lost()
-        # Before the sessions send: a point that is late on one board must not leave on another.
-        self._drop_late_points()
         if self._host_time is not None:
             self._host_time.seek(self._present, self._are_boards_ready)
         # One wait per turn, or the leases of several boards would be renewed a wait apart.
@@ -137,13 +134,13 @@ class BoardGroup(GroupState):
         dark_s = self._clock.now_s() + session.lease_s + LEASE_TRANSIT_MAX_S
         self.lost = LostStage(self.sessions.index(session), reason, dark_s)
         self._present = tuple(one for one in self.sessions if one is not session)
-        self._is_loss_new = True
+        self._new_loss = reason
         return True
 
-    def pop_loss(self) -> bool:
-        """Return whether a board was lost since the last call: the others must be dark until it is so for certain."""
-        is_new, self._is_loss_new = self._is_loss_new, False
-        return is_new
+    def pop_loss(self) -> str:
+        """Return why a board was lost since the last call, '' if none: the others are dark until it is for certain."""
+        reason, self._new_loss = self._new_loss, ""
+        return reason
 
     def _readmit_lost(self) -> None:
         """Count the lost board again once all others are disarmed, and it too, as far as its link is up."""
@@ -152,22 +149,17 @@ class BoardGroup(GroupState):
         if self.lost is not None and not self.has_arming and are_idle and self.has_lost_ended:
             self.lost, self._present = None, self.sessions
 
-    def _drop_late_points(self) -> None:
-        """Drop the points of all boards if one would execute its next point late."""
-        if not self.has_several or self.is_draining:
-            return
-        lateness_s, session = max(((one.find_lateness_s(), one) for one in self._present), key=lambda item: item[0])
-        if lateness_s > 0.0 and session.board.state in ARMED_STATES:
-            self.flush()
-            self._refusal = f"{self._name(session)}light would have been {1e3 * lateness_s:.3g} ms late"
+    def describe_lateness(self) -> str:
+        """Return which board would execute its next point late, and why, '' if none would."""
+        return next((f"{self._name(one)}{late}" for one in self._present if (late := one.describe_lateness())), "")
 
     def compute_wait_s(self) -> float:
         """Return the longest time for which the next step may wait if no bytes arrive, s."""
         return min(connector.compute_wait_s() for connector in self._connectors)
 
     def pop_refusal(self) -> str | None:
-        """Return and clear the reason for which a board, or this group, refused the last command."""
-        refusal, self._refusal = self._refusal, None
+        """Return and clear the reason for which a board refused the last command."""
+        refusal = None
         for session in self._present:
             refused = session.pop_refusal()
             if refused is not None:
@@ -205,7 +197,7 @@ class BoardGroup(GroupState):
     def end_arming(self) -> None:
         """End the arming of all boards: neither lease nor confirmation, nor points handed over so far."""
         # A loss that nobody has read yet is of the arming that ends here.
-        self._were_armed = self._is_loss_new = False
+        self._were_armed, self._new_loss = False, ""
         for session in self.sessions:
             session.end_arming()
 

@@ -4,8 +4,8 @@ Sent points are final. Points not yet sent may be replaced by a newer plan witho
 
 END leaves with the last point, a lead before the light ends, so that a stall of the host is no underrun. What follows
 after that moves the end: of several ENDs of a running job the board obeys the last, so each DATA has its own. If the
-host stalls until the board has ended the job at the former END, it is armed with points in its queue, and another
-START lets it go on: late, as after an underrun.
+host stalls until the board has ended the job at the former END, it is armed with points in its queue, which are late,
+as after an underrun: the owner drops them (`BoardSession.describe_lateness`).
 
 After a FLUSH the last reports are collected, which tell the executed points from those that the board dropped.
 """
@@ -66,8 +66,6 @@ class PointDrain:
 
 MISSING_REPORT_RETRY_S = 0.1
 WATERMARK_POINTS = 48
-ENDS_KEPT = 64
-"""ENDs of a job of which the board may have obeyed an earlier one: more than are on their way at once."""
 
 
 class PointStream:
@@ -81,8 +79,7 @@ class PointStream:
         self._number = 0
         self._next_index = 0
         self._sent_index = 0
-        self._started = self._end_was_moved = False
-        self._end_indices: deque[int] = deque(maxlen=ENDS_KEPT)
+        self._started = self._ended = self._end_was_moved = False
         self._reports_requested_s = 0.0
 
     def __bool__(self) -> bool:
@@ -105,8 +102,7 @@ class PointStream:
         """
         self._number += 1
         # START leaves with the first DATA, not here: it names a point that the board must have.
-        self._started = self._end_was_moved = False
-        self._end_indices.clear()
+        self._started = self._ended = self._end_was_moved = False
         return self._append(points, start_tick, send_ahead_ticks, timing, holds_first=False)
 
     @property
@@ -136,7 +132,7 @@ class PointStream:
         if not self._started or not self.can_truncate(kept_points):
             return False
         # The END of one board cannot be moved without those of the others, which may have ended already.
-        if self._end_indices and self._jobs[-1].follows_host:
+        if self._ended and self._jobs[-1].follows_host:
             return False
         # Later than now by SPLICE_LEAD_S, or the board could run empty before the first new point arrives.
         return self._jobs[-1].end_tick_after(kept_points) >= min_end_tick
@@ -214,16 +210,6 @@ class PointStream:
         """Whether the board may have ended the job before it got an END that moves the end. It refuses that one."""
         return self._end_was_moved
 
-    def restart_if_ended(self, link: HostConnection, done_index: int) -> None:
-        """Start the job again if the armed board has ended it before it got the END that moved the end."""
-        is_left = bool(self._jobs) and done_index < self._jobs[-1].end_index
-        # All of it acknowledged and the board idle exactly at an END: else the moved END may still be on its way.
-        if not self._end_was_moved or link.outstanding or not is_left or done_index not in self._end_indices:
-            return
-        # Tick 0, at once: the light is late already.
-        link.send(m.Start(self._number, done_index, 0, min(WATERMARK_POINTS, max(1, self._sent_index - done_index))))
-        self._end_indices.clear()
-
     def send(self, link: HostConnection, done_index: int, queue_points: int, now_tick: float) -> None:
         """Send the points that are due and that the board has room for, START and END."""
         for job in self._jobs:
@@ -237,16 +223,24 @@ class PointStream:
             # In order: no point of a later job before the last one of this.
             if not job.is_fully_sent:
                 return
-        if self._jobs and not self._end_indices and link.outstanding < link.window:
+        if self._jobs and not self._ended and link.outstanding < link.window:
             self._send_end(link)
 
     def _send_end(self, link: HostConnection) -> None:
-        self._end_indices.append(self._sent_index)
+        self._ended = True
         link.send(m.End(self._number, self._sent_index))
 
     def find_start_tick(self) -> int | None:
         """Return the board tick at which the next unsent point begins, None if all were sent."""
         return next((job.find_start_tick() for job in self._jobs if not job.is_fully_sent), None)
+
+    def find_sent_tick(self, done_index: int) -> int | None:
+        """Return the board tick at which the next point behind done_index begins, None unless it was sent."""
+        for job in self._jobs:
+            index = max(done_index, job.first_index)
+            if index < job.next_to_send:
+                return job.end_tick_after(index - job.first_index)
+        return None
 
     def find_due_tick(self) -> float | None:
         """Return the board tick from which the next point may be sent, None if no point waits for its time."""
@@ -263,7 +257,7 @@ class PointStream:
             # After the first DATA, so that START finds a point; the watermark never exceeds what is about to leave.
             link.send(m.Start(self._number, job.first_index, job.start_tick, watermark))
             self._started = True
-        elif self._end_indices:
+        elif self._ended:
             self._send_end(link)
             self._end_was_moved = True
 
@@ -278,5 +272,5 @@ class PointStream:
     def drop_finished(self, armed: bool) -> None:
         """Drop completely reported jobs, the last one only after the board has ended it."""
         # The last job stays until the board is ARMED again: a newer plan may still be spliced behind it.
-        while self._jobs and self._jobs[0].is_finished and (len(self._jobs) > 1 or (self._end_indices and armed)):
+        while self._jobs and self._jobs[0].is_finished and (len(self._jobs) > 1 or (self._ended and armed)):
             self._jobs.popleft()

@@ -41,6 +41,8 @@ from optodrive.link.transport.base import Transport
 WAIT_MIN_S, WAIT_MAX_S = 0.001, 0.01
 RETRANSMISSION_WAIT_S = BATCH_WAIT_S = 0.002
 """Shortest wait for a retransmission, and for further points to become due, so that frames hold several."""
+REPORT_S = 0.005
+"""Longest time from the begin or end of a job to the board's report of it, unless it is lost."""
 SPLICE_LEAD_S = 0.005
 """Minimum time between a splice and the end of the points before it."""
 
@@ -134,7 +136,7 @@ class BoardSession(BoardLink):
     def _on_nak(self, message: m.Nak, now_s: float) -> None:
         reason = m.NAK_REASONS[message.reason]
         if reason == "STATE" and self._points.may_have_ended:
-            return  # the job is started again
+            return  # the points are late, see describe_lateness()
         if reason not in m.NOT_CONSUMED and self._refusal is None:  # the first refusal causes the following ones
             self._refusal = reason
 
@@ -290,10 +292,17 @@ class BoardSession(BoardLink):
         """The last job of those that are not finished."""
         return self._points.last
 
-    def find_lateness_s(self) -> float:
-        """Return by how much the next unsent point is late, s, at most 0 while there is time to send it."""
-        start_tick = self._points.find_start_tick()
-        return -inf if start_tick is None else self.board_s() - start_tick * self.scale.tick_s
+    def describe_lateness(self) -> str:
+        """Return why the armed board would execute its next point late, '' if it would not."""
+        if not self.has_arming or self.board.state not in ARMED_STATES or self.is_draining:
+            return ""
+        ticks = [(self._points.find_start_tick(), 0.0)]
+        # A line that loses bytes: what was sent has not arrived, and the board has not begun, has ended or waits.
+        if self.board.state != BoardState.RUNNING:
+            ticks.append((self._points.find_sent_tick(self.board.done_index), REPORT_S))
+        now_s, tick_s = self.board_s(), self.scale.tick_s
+        late_s = max((now_s - tick * tick_s - wait_s for tick, wait_s in ticks if tick is not None), default=0.0)
+        return f"light would have been {1e3 * late_s:.3g} ms late" if late_s > 0.0 else ""
 
     def can_truncate(self, kept_points: int) -> bool:
         """Return whether the last job can be truncated to `kept_points` points."""
@@ -312,9 +321,6 @@ class BoardSession(BoardLink):
             return
         if self.board.state in ARMED_STATES:  # else the board has ended the job: only collect its reports
             now_tick = self.board_s() / self.scale.tick_s
-            # Only an armed board can have ended the job early; a running one obeys the moved END.
-            if self.board.state == BoardState.ARMED:
-                self._points.restart_if_ended(self._connection, self.board.done_index)
             self._points.send(self._connection, self.board.done_index, self._queue_points, now_tick)
         self._points.request_missing_reports(self._connection, self.board.done_index, self._clock.now_s())
         self._points.drop_finished(self.board.state == BoardState.ARMED)

@@ -117,9 +117,12 @@ class StagedJob:
         done = on_tick >= 0
         return StageReports(row[done], on_tick[done], on_ticks[done], power_w[done], stage[done], late[done])
 
-    def find_begin_tick(self, reported: StageReports, plan: PulsePlan, tick_s: float) -> IntArray:
-        """Return the tick at which each reported pulse of `plan` began, also of those without light, [n]."""
-        planned_tick = self.zero_tick + plan.start_s[reported.row] / tick_s
+    def find_begin_tick(self, reported: StageReports, plan: PulsePlan, tick_s: float, zero_s: float) -> IntArray:
+        """Return the tick at which each reported pulse of `plan` began, also of those without light, [n].
+
+        zero_s: time of the plan at which the points begin
+        """
+        planned_tick = self.zero_tick + (plan.start_s[reported.row] - zero_s) / tick_s
         return find_begin_tick(reported.on_tick, reported.on_ticks, reported.late_ticks, planned_tick)
 
     def list_executed_rows(self) -> IntArray:
@@ -127,19 +130,19 @@ class StagedJob:
         rows = [part.list_executed_rows() for part in self.parts]
         return rows[0] if len(rows) == 1 else np.sort(np.concatenate(rows))
 
-    def build_executed(self, plan: PulsePlan, scales: Sequence[WireScale]) -> ExecutedPulses:
+    def build_executed(self, plan: PulsePlan, scales: Sequence[WireScale], zero_s: float = 0.0) -> ExecutedPulses:
         """Return the reported pulses of `plan`. They are complete if none is missing from the untruncated part.
 
-        scales: of each stage
+        scales: of each stage; zero_s: time of the plan at which the points begin
         """
         reported, tick_s = self.read_reported(0, len(self._row), scales), scales[0].tick_s
-        on_tick = self.find_begin_tick(reported, plan, tick_s)
+        on_tick = self.find_begin_tick(reported, plan, tick_s, zero_s)
         return ExecutedPulses(
             on_tick=on_tick,
             width_ticks=reported.on_ticks,
             pixel=plan.pixel[reported.row],
             power_w=reported.power_w,
-            start_s=np.asarray((on_tick - self.zero_tick) * tick_s, dtype=np.float64),
+            start_s=np.asarray((on_tick - self.zero_tick) * tick_s + zero_s, dtype=np.float64),
             width_s=np.asarray(reported.on_ticks * tick_s, dtype=np.float64),
             stage=reported.stage,
             complete=all(part.is_complete for part in self.parts),

@@ -1,40 +1,10 @@
-"""Limit the rest of a limited plan again, after an interruption and from another budget state."""
+"""Rows of a limited plan from one on, replaced or later."""
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 
-import numpy as np
-
-from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
+from optodrive.core.types.plans import BudgetState, LimitedPlan
 from optodrive.planning.limiter.budget import Budget
-from optodrive.planning.limiter.limiter import CHUNK_PULSES, concatenate, limit
-
-
-def limit_rest(
-    plan: LimitedPlan,
-    first_row: int,
-    shift_s: float,
-    state: BudgetState,
-    budget: Budget,
-    on_progress: Callable[[], None],
-) -> tuple[LimitedPlan, BudgetState]:
-    """Limit the rows of a plan from first_row on, each shift_s later, and return them with the state after them.
-
-    No pulse has more power than before. Shifted times and state.at_s are on the same time line. The energy that was
-    removed, and its reason, include those of the plan.
-    """
-    old = _slice_rows(plan, slice(first_row, None), shift_s)
-    limited = []
-    for begin in range(0, len(old), CHUNK_PULSES):
-        rows = slice(begin, begin + CHUNK_PULSES)
-        columns = {item.name: getattr(old, item.name)[rows] for item in fields(PulsePlan)}
-        chunk, state = limit(PulsePlan(**columns), state, budget)
-        limited.append(chunk)
-        on_progress()
-    rest = concatenate(limited, state, budget)
-    # A row that was trimmed before keeps its reason: its power is still the lower one.
-    reason = np.where(rest.reason != "", rest.reason, old.reason)
-    return replace(rest, trimmed_j=old.trimmed_j + rest.trimmed_j, reason=reason), state
+from optodrive.planning.limiter.limiter import concatenate
 
 
 def replace_rest(

@@ -228,23 +228,22 @@ def test_arming_is_of_all_boards_or_of_none(monkeypatch):
     assert not list_states(rig) & set(ARMED_STATES)
 
 
-def test_light_that_would_be_late_is_not_emitted_and_the_boards_stay_armed(wide_rig):
+def test_light_that_would_be_late_is_not_emitted_and_the_rest_is_planned_anew(wide_rig):
     """Boards that execute points late would no longer agree about the order of their pulses."""
     rig = wide_rig
     record = submit(rig, fill(60.0), streamed=True)
     rig.until(lambda: record.executed_count > 20)
     rig.clock.sleep(0.8 * LEASE_S)  # longer than points are sent ahead
-    run(rig, 0.1)
-    assert record.status == "failed"
-    assert "late" in record.error
-    assert list_states(rig) == {BoardState.ARMED}
-    assert record.executed_count <= len(rig.list_pulses()) < 437
+    rig.until(lambda: list_states(rig) == {BoardState.ARMED})
+    assert len(rig.list_pulses()) < 437
+    assert finish(rig, record).status == "done"
+    assert record.executed_count == len(rig.list_pulses())
+    assert record.execution.simulated_m == pytest.approx(np.full(record.executed_count, 60e-6), rel=0.01)
     assert abs(record.timing_error.max_abs_s) < 1e-4
-    assert finish(rig, submit(rig, fill(40.0))).status == "done"
 
 
 @pytest.mark.parametrize("resumed_s", [0.001, 0.008])
-def test_light_after_a_board_ran_out_of_points_is_late(rig, resumed_s):
+def test_light_after_a_board_ran_out_of_points_is_late_and_planned_anew(rig, resumed_s):
     """The host goes on before the gate of the next point is due, which the board has not begun in time."""
     record = submit(rig, build_trains(len(rig.cores), 9.0), streamed=True)
     rig.until(lambda: record.executed_count > 20)
@@ -253,10 +252,9 @@ def test_light_after_a_board_ran_out_of_points_is_late(rig, resumed_s):
         for core, link in zip(rig.cores, rig.links, strict=True):
             core.advance(link._now_us())
     rig.clock.sleep(resumed_s)
-    run(rig, 0.1)
-    assert record.status == "failed"
-    assert "late" in record.error
-    assert list_states(rig) == {BoardState.ARMED}
+    rig.until(lambda: list_states(rig) == {BoardState.ARMED})
+    finish(rig, record)
+    assert (record.status, record.executed_count) == ("done", len(rig.list_pulses()))
     assert abs(record.timing_error.max_abs_s) < 1e-4
 
 
