@@ -14,8 +14,9 @@ DRIVE = DriveRange.from_laser(2.45, 5000.0, 0.050)
 
 def pulse_for_peak(pixel, theta_k, gamma_k, target_m, drive, min_periods=1, from_s=0.0):
     target_k = target_m / pixel.kappa_m_per_k
-    span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods, drive.is_fine)
-    periods, duty = find_shortest_pulse(pixel, theta_k, gamma_k, target_k, *span, from_s)
+    span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
+    permitted = (drive.is_fine, drive.min_duty)
+    periods, duty = find_shortest_pulse(pixel, theta_k, gamma_k, target_k, *span, *permitted, from_s)
     return (periods, duty) if periods else None
 
 
@@ -83,6 +84,35 @@ def test_a_fine_pulse_of_more_than_a_period_has_full_power_and_the_nearest_micro
 
     assert miss_m(width_us) <= min(miss_m(width_us - 1), miss_m(width_us + 1)) + 1e-15
     assert 1e6 * DRIVE.period_s * (whole[0] - 1) <= width_us <= 1e6 * DRIVE.period_s * whole[0]
+
+
+@given(share=st.floats(1e-4, 1.0), theta=st.floats(0.0, 20.0))
+def test_a_laser_that_is_on_or_off_gets_the_nearest_microsecond(share, theta):
+    drive, target_m = replace(DRIVE, is_fine=True, min_duty=1.0), share * max_displacement_m(PIXEL, DRIVE)
+    assert drive.is_on_off
+    pulse = pulse_for_peak(PIXEL, theta, 0.0, target_m, drive)
+    width_us = 0.0 if pulse is None else pulse[0] * DRIVE.period_s * 1e6
+    assert width_us == pytest.approx(round(width_us), abs=1e-6)
+    assert pulse is None or pulse[1] == 1.0
+
+    def miss_m(us):
+        return abs(pulse_peak(PIXEL, theta, 0.0, 2.45, us * 1e-6)[0] * PIXEL.kappa_m_per_k - target_m)
+
+    assert miss_m(width_us) <= min(miss_m(max(0.0, width_us - 1)), miss_m(width_us + 1)) + 1e-15
+
+
+@given(share=st.floats(1e-4, 1.0), theta=st.floats(0.0, 20.0), weakest=st.floats(0.05, 0.95))
+def test_no_pulse_is_weaker_than_the_laser_emits(share, theta, weakest):
+    target_m = share * max_displacement_m(PIXEL, DRIVE)
+    free, pulse = (pulse_for_peak(PIXEL, theta, 0.0, target_m, replace(DRIVE, min_duty=d)) for d in (0.0, weakest))
+    if free is None or free[1] >= weakest:
+        assert pulse == free
+        return
+    periods, duty = pulse or (0.0, 0.0)
+    energy = free[0] * free[1]
+    permitted = [0.0] if free[0] == 1 else [free[0] - 1.0]
+    assert pulse is None or duty >= weakest
+    assert abs(periods * duty - energy) <= min(abs(each - energy) for each in (*permitted, free[0] * weakest)) + 1e-9
 
 
 def test_no_pulse_where_the_heat_is_enough():
