@@ -1,4 +1,4 @@
-"""`optodrive board settings | build | flash`: from a configuration to the firmware of a board."""
+"""`optodrive board settings | build | flash | emulate`: from a configuration to the firmware of a board."""
 
 import secrets
 from dataclasses import asdict
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 UID_BYTES = 12
 
-GROUP = typer.Typer(help="Build and flash the firmware of a Raspberry Pi Pico.", no_args_is_help=True)
+GROUP = typer.Typer(help="Build, flash and emulate the firmware of a Raspberry Pi Pico.", no_args_is_help=True)
 
 
 def _load_settings(config: str | None, stage: str | None) -> "tuple[Config, PicoSettings]":
@@ -114,3 +114,46 @@ def flash(
         f"{'next':<17}optodrive doctor --board PORT, which never arms",
     ]
     print_answer(document, lines, json)
+
+
+@GROUP.command()
+def emulate(
+    file: Annotated[Path, typer.Argument(metavar="FILE.uf2", help="Image, as `optodrive board build` writes it.")],
+    port: Annotated[
+        Path, typer.Option("--port", metavar="LINK", help="Link to create: board.port of the configuration.")
+    ],
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="pins.jsonl", help="Write edges of the gate and moves of the mirrors."),
+    ] = None,
+    modules: Annotated[
+        Path, typer.Option("--modules", metavar="FOLDER", help="Folder in which npm has installed rp2040js.")
+    ] = Path("~/.local/share/optodrive"),
+) -> None:
+    """Run an image in an emulator of the Pico's chip, with a port to which `optodrive serve` connects."""
+    import json as lines
+    import signal
+    from contextlib import ExitStack
+
+    from optodrive.core.files import check_output, read_bounded
+    from optodrive.link import boot_loader
+    from optodrive.link.simulator.emulated_pico import EmulatedPico, find_modules
+
+    check_output("--log", log, ".jsonl")
+    image = boot_loader.read_image(file, read_bounded(file, boot_loader.IMAGE_MAX_BYTES))
+    emulator = find_modules(modules.expanduser().absolute())
+    with ExitStack() as stack:
+        firmware = stack.enter_context(as_file(locate_shipped_folder("firmware_protocol")))
+        written = None if log is None else stack.enter_context(log.open("w", buffering=1))
+
+        def write_event(event: dict[str, object]) -> None:
+            if written is not None:
+                written.write(lines.dumps(event) + "\n")
+
+        pico = stack.enter_context(EmulatedPico(image, firmware, emulator, port.absolute(), write_event))
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: pico.stop())
+        print(f"{'port':<17}{port}: the USB port of a Pico with {file}, in the chip's own, slower time")
+        environment = f"export BOARD_TIME={pico.time_file} LD_PRELOAD={pico.library}"
+        print(f"{'next':<17}in another terminal: {environment}; optodrive serve --config my.toml", flush=True)
+        pico.run()

@@ -1,7 +1,7 @@
 """`optodrive serve` plays an experiment on the Pico's image through its USB port, in the chip's time.
 
-The daemon is the command as it is; its monotonic clock is the chip's (tests/pico/board_time.c), so that both are late
-together.
+The daemon is the command as it is; its monotonic clock is the chip's (firmware_protocol/emulator/board_time.c), so that
+both are late together.
 """
 
 import json
@@ -11,10 +11,12 @@ import sys
 from functools import partial
 
 import pytest
+from emulated_pico import EMULATION
 from emulated_pico import HERE as PICO
 
 import test_six_experiments as paper
 from firmware_ports import require
+from optodrive.link.simulator.emulated_pico import build_clock
 from rig import Daemon, wait_for
 
 BEGIN_NS = 1_000_000_000_000
@@ -49,12 +51,11 @@ class PicoProcess:
         self.process.wait()
 
 
-def build_clock(folder):
+def make_clock(folder):
     """Build the library that gives a program the chip's time."""
-    require("gcc")
+    require("cc")
     library = folder / "board_time.so"
-    flags = ["-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC"]
-    subprocess.run(["gcc", *flags, "-o", library, PICO / "board_time.c", "-ldl"], check=True)
+    build_clock(EMULATION / "board_time.c", library)
     return library
 
 
@@ -69,7 +70,7 @@ def board(tmp_path):
 def daemon(tmp_path, board, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setenv("BOARD_TIME", str(board.time))
-        patched.setenv("LD_PRELOAD", str(build_clock(tmp_path)))
+        patched.setenv("LD_PRELOAD", str(make_clock(tmp_path)))
         daemon = Daemon(tmp_path, board.port, lease_s=LEASE_S, is_fresh=True, stages=OFTEN)
     yield daemon
     daemon.stop()

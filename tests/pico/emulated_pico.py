@@ -24,7 +24,7 @@ from optodrive.link.simulator.guards import INTERFACES, BoardSettings
 
 HERE = Path(__file__).parent
 PORT = HERE.parents[1] / "firmware_protocol" / "ports" / "rp2040"
-CORE = PORT.parents[1] / "core"
+CORE, EMULATION = PORT.parents[1] / "core", PORT.parents[1] / "emulator"
 MODULES = Path(sys.prefix).parent / ".node"
 EMULATOR = MODULES / "node_modules" / "rp2040js" / "dist" / "esm" / "index.js"
 SETTINGS = struct.Struct("<3H2x3I8H12sI4H?B2x")
@@ -151,7 +151,7 @@ class EmulatedPico:
         with tempfile.NamedTemporaryFile("w", suffix=".json", delete=False) as file:
             json.dump(setup, file)
         self._process = subprocess.Popen(
-            ["node", HERE / "bench.mjs", file.name],
+            ["node", EMULATION / "bench.mjs", file.name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,

@@ -1,4 +1,5 @@
-// One power cycle of an RP2040 with the firmware's image, its circuit and a witness of its pins.
+// One power cycle of an RP2040 with the firmware's image, its circuit and a witness of its pins; with the image's symbols, of
+// what its core does, too.
 
 import { Uart } from "./uart.mjs";
 import { UsbHost } from "./usb.mjs";
@@ -30,7 +31,8 @@ export class Chip {
     if (memory) rp2040.sram.set(memory);
     rp2040.flash.set(setup.flash);
     this.ram = rp2040.sramView;
-    for (let at = setup.symbols.bss_end; at < RAM + RAM_BYTES; at += 4) this.ram.setUint32(at - RAM, PAINT, true);
+    this.at = setup.symbols ?? {};
+    for (let at = this.at.bss_end; at < RAM + RAM_BYTES; at += 4) this.ram.setUint32(at - RAM, PAINT, true);
     this.core = rp2040.core;
     this.clock = rp2040.clock;
     this.uart = new Uart(rp2040, UART_IRQ, (byte) => emit("byte", this.micros, byte));
@@ -56,8 +58,7 @@ export class Chip {
     this.core.PC = FLASH; // the ROM runs the second stage, here in place
     this.core.SP = RAM + RAM_BYTES;
     this.hooks = new Uint8Array(RAM_BYTES / 2);
-    this.at = setup.symbols;
-    for (const name of ["change_state", "outputs_set_gate", "xy2_100_move"]) this.hooks[(this.at[name] - RAM) >> 1] = 1;
+    for (const name of setup.symbols ? ["change_state", "outputs_set_gate", "xy2_100_move"] : []) this.hooks[(this.at[name] - RAM) >> 1] = 1;
   }
 
   // Adds to the emulator what the witness sees, and the time of an SPI byte.
@@ -183,6 +184,7 @@ export class Chip {
   }
 
   countBadFrames() {
+    if (!this.setup.symbols) return;
     const count = this.read32("crc_errors") + this.read32("format_errors");
     if (count !== this.badFrames) this.emit("rx_error", this.micros, count);
     this.badFrames = count;
