@@ -10,6 +10,8 @@ from optodrive.daemon.api.openapi import LIVE_FRAME_SCHEMA
 from optodrive.daemon.responses.messages import FingersMessage, FingersRefusal, FrameResult, HoldReport
 from optodrive.daemon.responses.telemetry import EVENTS
 
+MODELS = (FrameResult, FingersMessage, FingersRefusal, HoldReport, *EVENTS.values())
+"""Bodies of the messages."""
 REF_TEMPLATE = "#/components/schemas/{model}"
 BINARY_FRAME = "ODF1, a u32 frame number, and one u16 height per pixel in 0.1 µm, little-endian"
 HEAD = """# Streams
@@ -81,8 +83,7 @@ FROM_CLIENT = {"stream": ("frame", "binaryFrame"), "fingers": ("places",), "hold
 
 def build_document():
     """Build the AsyncAPI document."""
-    models = [FrameResult, FingersMessage, FingersRefusal, HoldReport, *EVENTS.values()]
-    _, schemas = models_json_schema([(model, "serialization") for model in models], ref_template=REF_TEMPLATE)
+    _, schemas = models_json_schema([(model, "serialization") for model in MODELS], ref_template=REF_TEMPLATE)
     operations = {}
     for name, channel in CHANNELS.items():
         for action, is_received in (("receive", True), ("send", False)):

@@ -27,18 +27,11 @@ permitted values and the default.
 """
 TERMS_HEAD = """# Terms
 
-Generated from `optodrive/physics/terms` by `scripts/reference`. `optodrive terms TERM` prints one with a complete file
-that states it. A term is a physical effect beyond the nominal pixel. A parameter set may hold its parameters,
-`optodrive diagnose` looks for it in recordings, and the limiter bounds the heat that it can add.
+Generated from `optodrive/physics/terms` by `scripts/reference`. A term is a physical effect beyond the nominal pixel. A
+[parameter set](formats/parameter-sets.md) (`model.toml`) may hold its parameters, `optodrive diagnose` looks for it in
+recordings, and the limiter bounds the heat that it can add. `optodrive terms TERM` prints the parameters, with unit,
+range, source and the value of one that may be omitted, and a complete file that states the term.
 
-A [parameter set](formats/parameter-sets.md) (`model.toml`) states a term as a table:
-
-```toml
-[terms.heat_capacity]
-slope = { value = 0.002, unit = "1/K", source = "measured on …" }
-```
-
-In brackets stand unit, range, and the value of a parameter that may be omitted.
 `planner_terms` names the terms that heights are planned with. `simulate --truth model.toml` simulates these and every
 term that the file itself states; those of its base count only if `planner_terms` names them.
 
@@ -110,23 +103,21 @@ def build_configuration_reference() -> str:
 
 
 def build_terms_reference() -> str:
-    """Return Markdown with one section per term. Parameters that differ in name only share a line."""
+    """Return Markdown with one section per term."""
     parts = [TERMS_HEAD]
     for key, term in sorted(discover_terms().items()):
         about = describe_term(term)
-        rows: dict[str, list[str]] = {}
+        units: dict[str, list[str]] = {}
         for item in about["parameters"]:
-            omitted = "" if item["if_omitted"] is None else f"; {item['if_omitted']:g}"
-            values = f"{item['unit']}; {item['low']:g} to {item['high']:g}{omitted}"
-            rows.setdefault(f"({values}): {item['source']}", []).append(f"`{item['name']}`")
+            units.setdefault(item["unit"], []).append(f"`{item['name']}`")
+        names = "; ".join(f"{', '.join(named)} ({unit})" for unit, named in units.items())
         notes = [f"Needs {', '.join(f'`{name}`' for name in term.requires)}."] if term.requires else []
         if not term.in_pixel:
             notes.append("Only the limiter accounts for it; heights are not planned with it.")
         if term.signature:
             notes.append(f"Visible in {term.signature}.")
-        text = [about["label"][:1].upper() + about["label"][1:] + ".", "", about["equation"], *notes]
-        lines = [f"- {', '.join(names)} {values}" for values, names in rows.items()]
-        parts.append("\n".join([f"## `{key}`", "", *text, "", *lines, ""]))
+        text = [about["label"][:1].upper() + about["label"][1:] + f". Parameters: {names}.", "", about["equation"]]
+        parts.append("\n".join([f"## `{key}`", "", *text, *notes, ""]))
     return "\n".join(parts)
 
 

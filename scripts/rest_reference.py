@@ -4,6 +4,8 @@ import json
 import re
 from pathlib import Path
 
+from async_reference import MODELS
+
 from optodrive.core.toml_model import Section
 from optodrive.daemon.api.app import build_app
 from optodrive.daemon.api.daemon_client import DaemonClient
@@ -31,7 +33,8 @@ MODELS_HEAD = """## Models
 
 The JSON bodies: each member with its type and meaning. A member with `?` may be null. One without a type is a number if
 its name ends in a unit, a boolean if its meaning begins with "whether", else a string. Members of `Problem`,
-`FrameResult` and `HoldReport` that do not apply are absent; all other models always have all members.
+`FrameResult` and `HoldReport` that do not apply are absent; all other models always have all members. Of a model within
+a model the page says what its choices are and when a member is null; `/openapi.json` describes every member.
 """
 
 FILLERS = """a all an and any as at by each first for from has have if in index into is it of on or that the their them
@@ -80,8 +83,13 @@ def build_rest_reference():
     sections.append(MODELS_HEAD)
     schemas = document["components"]["schemas"]
     configured = {name for name in schemas if is_section(getattr(config_sections, name, None))}
+    outer = {name for name in schemas if f"(#{name.lower()})" in "".join(sections)} | {
+        model.__name__ for model in MODELS
+    }
     sections += [
-        format_model(name, schema, configured) for name, schema in sorted(schemas.items()) if name not in configured
+        format_model(name, schema, configured, name not in outer)
+        for name, schema in sorted(schemas.items())
+        if name not in configured
     ]
     return "\n".join(sections)
 
@@ -134,8 +142,11 @@ def format_content(response):
     return format_type(content["schema"]) if "$ref" in content["schema"] else media_type
 
 
-def format_model(name, schema, configured):
-    """Format one model: its description and members. The page on the configuration has those of `configured`."""
+def format_model(name, schema, configured, is_inner):
+    """Format one model: its description and members. The page on the configuration has those of `configured`.
+
+    is_inner: whether it is part of other models only, so that the page says less of its members
+    """
     lines = [f"### {name}", ""]
     inherited = list_configured_members(name)
     members = {
@@ -159,7 +170,8 @@ def format_model(name, schema, configured):
     rows, bare = [], []
     for group in sorted([*meanings, *rest], key=lambda group: list(members).index(group[0])):
         meaning = meanings.get(group, "")
-        is_said = split_words(meaning) <= known | split_words(" ".join(group)) | SAYS_LITTLE
+        is_plain = not any(members[member].startswith(("(", "`")) for member in group)
+        is_said = split_words(meaning) <= known | split_words(" ".join(group)) | SAYS_LITTLE or (is_inner and is_plain)
         row = format_members({member: members[member] for member in group}, "" if is_said else meaning)
         (bare if is_said else rows).append(row)
     rows += [f"- {'; '.join(bare)}"] if bare else []
