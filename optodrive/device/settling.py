@@ -1,8 +1,8 @@
 """Settling times of the mirrors: how long a move keeps the gate closed until the whole focus stays on the absorber.
 
 Both axes move at once, and the slower one decides. Residual ringing of earlier moves takes a share of the tolerance,
-see docs/decisions/0013-gate-by-trajectory.md. The times hold for every servo within the declared uncertainty, see
-docs/decisions/0074-servos-within-their-uncertainty.md.
+see docs/decisions/0013-gate-by-trajectory.md. The times hold for every servo within the declared uncertainty
+(`settling_bound.py`).
 """
 
 from collections.abc import Callable

@@ -3,7 +3,7 @@
 The loop that owns the session calls everything. Any thread may read `state`, and call make_snapshot() and
 require_epoch(): a state is one value, so that no lock is needed.
 
-Streams. A source that sends frames wants the newest shown, not a queue of the past (decision 16). Points of a streamed
+Streams. A source that sends frames wants the newest shown, not a queue of the past. Points of a streamed
 plan leave only `lead_s` before they are due; a newer plan cuts the running one at the first point that has not left
 (`build_cut_snapshot`) and goes on behind it, one job for the board. If all points have left it follows them, with a
 pause if it comes early, as long as the light of the last one is not about to end. Its first point is held back if yet

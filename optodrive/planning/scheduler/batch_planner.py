@@ -14,7 +14,7 @@ mirrors, and each is the same call from the same state. Starts are whole microse
 a draft are in order of their starts, those of all stages.
 
 Order. Trains have requested times, frames only a deadline: a train pulse goes first if the next pulse of a round would
-delay it (`_is_train_due`, decision 3). With several stages each has one candidate pulse, and the earliest of them is
+delay it (`_is_train_due`). With several stages each has one candidate pulse, and the earliest of them is
 drafted next, so that no stage runs ahead of heat that another adds (decision 41). A candidate of another stage stays
 valid, because stages share no pixel; a drafted train pulse invalidates all, because it moves a beam.
 
