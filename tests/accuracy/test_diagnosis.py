@@ -112,19 +112,32 @@ def test_two_hidden_causes_are_named_together():
     assert set(found.causes) == set(TWO)
 
 
-def test_a_cause_is_found_beside_a_mean_of_past_samples_at_two_intervals():
+def average_samples(name, count, late, terms, rates):
+    """Return a recording of which a program averaged one signal over a number of samples, missing ones on a line."""
     runs = []
-    for rate, groups in ((2000.0, ("weak", "middle", "strong", "short")), (500.0, ("train",))):
-        for run in lab(9, {"bridge_conductivity": {"exponent": 0.6}}, groups=groups, rate=rate).runs:
-            signal = run.signals["displacement_m"]
+    for rate, groups in zip(rates, (("weak", "middle", "strong", "short"), ("train",)), strict=True):
+        for run in lab(9, terms, groups=groups, rate=rate).runs:
+            signal = run.signals[name]
             there = np.isfinite(signal.value)
-            value = np.interp(signal.t_s, signal.t_s[there], signal.value[there])
-            averaged = replace(signal, value=uniform_filter1d(value, 15, origin=7))
-            runs.append(replace(run, name=f"run{len(runs)}", signals=run.signals | {"displacement_m": averaged}))
-    found = diagnose(Measurement(tuple(runs)))
+            value = uniform_filter1d(np.interp(signal.t_s, signal.t_s[there], signal.value[there]), count, origin=late)
+            averaged = replace(signal, value=np.where(there, value, np.nan))
+            runs.append(replace(run, name=f"run{len(runs)}", signals=run.signals | {name: averaged}))
+    return Measurement(tuple(runs))
+
+
+def test_a_cause_is_found_beside_a_mean_of_past_samples_at_two_intervals():
+    terms = {"bridge_conductivity": {"exponent": 0.6}}
+    found = diagnose(average_samples("displacement_m", 15, 7, terms, (2000.0, 500.0)))
     assert (found.verdict, set(found.causes)) == ("cause", {"smoothing", "bridge_conductivity"})
     assert found.parameters["smoothing.displacement"].value == pytest.approx(0.015, rel=0.05)
     assert found.parameters["bridge_conductivity.exponent"].value == pytest.approx(0.6, rel=0.1)
+
+
+def test_a_mean_of_a_thermometers_samples_is_found_where_samples_lie_at_edges_and_are_missing():
+    found = diagnose(average_samples("absorber_temperature_K", 11, 0, {}, (2000.0, 487.0)))
+    assert (found.verdict, found.causes, found.disturbances) == ("cause", ("smoothing",), ())
+    assert found.parameters["smoothing.temperature"].value == pytest.approx(0.011, rel=0.005)
+    assert found.parameters["smoothing.order"].value == pytest.approx(0.0, abs=0.02)
 
 
 def move_zeros(recording, size_m=5e-6):

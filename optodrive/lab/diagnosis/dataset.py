@@ -34,23 +34,29 @@ CLOCKS = ("temperature", "displacement", "force", "mirrors", "mirrors")
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Samples of one signal of one run: kind is an index into SIGNALS, part the slice of the data vector."""
+    """Samples of one signal of one run: kind is an index into SIGNALS, part the slice of the data vector.
+
+    sampled_s: times at which its instrument sampled, t_s among them: a filter acted on all of them; rows: of t_s
+    """
 
     run: int
     kind: int
     pixel: int
     part: slice
     t_s: FloatArray
+    sampled_s: FloatArray
+    rows: IntArray
 
 
 class Samples(NamedTuple):
-    """Samples of one signal of one run before they are joined: kind is an index into SIGNALS."""
+    """Samples of one signal of one run before they are joined, as in `Block`."""
 
     run: int
     kind: int
     pixel: int
     t_s: FloatArray
     value: FloatArray
+    sampled_s: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +76,7 @@ class RunInfo:
 
 @dataclass(frozen=True, eq=False)
 class DriveGroup:
-    """Experiments with identical drive: one with the union of all sample times, and the rows of each block therein.
+    """Experiments with identical drive: one with all times of samples, and the rows of each block therein.
 
     block_rows: (kind, block number, rows)
     """
@@ -147,7 +153,7 @@ class Dataset:
         """Return the data of these runs and signal kinds. Doses and session times stay unchanged."""
         numbers = {old: number for number, old in enumerate(runs)}
         samples = [
-            Samples(numbers[block.run], block.kind, block.pixel, block.t_s, self.value[block.part])
+            Samples(numbers[block.run], block.kind, block.pixel, block.t_s, self.value[block.part], block.sampled_s)
             for block in self.blocks
             if block.run in numbers and block.kind in kinds
         ]
@@ -197,12 +203,12 @@ def build_dataset(measurement: Measurement) -> Dataset:
 def _select_samples(number: int, run: Run, name: str) -> Samples:
     """Return the finite samples of a signal: of a temperature, the rise above ambient, and none at a gate's edge."""
     signal, kind = run.signals[name], SIGNALS.index(name)
-    is_used = np.isfinite(signal.value)
+    is_used = is_finite = np.isfinite(signal.value)
     if kind == 0:
         # Displacement and force have no kink there: the gas smooths it.
-        is_used &= _is_off_edges(signal.t_s, run.pulses)
+        is_used = is_finite & _is_off_edges(signal.t_s, run.pulses)
     value = signal.value[is_used] - (run.ambient_k if kind == 0 else 0.0)
-    return Samples(number, kind, signal.pixel, signal.t_s[is_used], value)
+    return Samples(number, kind, signal.pixel, signal.t_s[is_used], value, signal.t_s[is_finite])
 
 
 def assemble_dataset(
@@ -215,7 +221,8 @@ def assemble_dataset(
     blocks: list[Block] = []
     values, offset = [np.zeros(0)], 0
     for item in samples:
-        blocks.append(Block(item.run, item.kind, item.pixel, slice(offset, offset + len(item.value)), item.t_s))
+        part, rows = slice(offset, offset + len(item.value)), np.searchsorted(item.sampled_s, item.t_s)
+        blocks.append(Block(item.run, item.kind, item.pixel, part, item.t_s, item.sampled_s, rows))
         values.append(item.value)
         offset += len(item.value)
     number_of = {(block.run, block.pixel, block.kind): number for number, block in enumerate(blocks)}
@@ -224,22 +231,24 @@ def assemble_dataset(
         first, second, third = (number_of.get((run, experiment.pixel, kind), -1) for kind in PIXEL_KINDS)
         if max(first, second, third) >= 0:
             numbered.append((experiment, (first, second, third)))
-    return Dataset(runs, tuple(blocks), tuple(numbered), _group_by_drive(numbered), np.concatenate(values))
+    return Dataset(runs, tuple(blocks), tuple(numbered), _group_by_drive(numbered, blocks), np.concatenate(values))
 
 
-def _group_by_drive(experiments: list[tuple[PixelExperiment, tuple[int, int, int]]]) -> tuple[DriveGroup, ...]:
+def _group_by_drive(
+    experiments: list[tuple[PixelExperiment, tuple[int, int, int]]], blocks: list[Block]
+) -> tuple[DriveGroup, ...]:
     by_drive: dict[tuple[bytes, int], list[tuple[PixelExperiment, tuple[int, int, int]]]] = {}
     for experiment, numbers in experiments:
         by_drive.setdefault((experiment.pulses.tobytes(), experiment.pixel), []).append((experiment, numbers))
     groups = []
     for members in by_drive.values():
         # Repeats of one drive are integrated once, at all their times.
-        times = [np.unique(np.concatenate([experiment.t_s[kind] for experiment, _ in members])) for kind in PIXEL_KINDS]
+        of_kind = [[numbers[kind] for _, numbers in members if numbers[kind] >= 0] for kind in PIXEL_KINDS]
+        times = [np.unique(np.concatenate([NEVER_S, *(blocks[n].sampled_s for n in own)])) for own in of_kind]
         rows = tuple(
-            (kind, numbers[kind], np.searchsorted(times[kind], experiment.t_s[kind]))
-            for experiment, numbers in members
-            for kind in PIXEL_KINDS
-            if numbers[kind] >= 0
+            (kind, number, np.searchsorted(times[kind], blocks[number].sampled_s))
+            for kind, own in zip(PIXEL_KINDS, of_kind, strict=True)
+            for number in own
         )
         groups.append(DriveGroup(replace(members[0][0], t_s=(times[0], times[1], times[2])), rows))
     return tuple(groups)

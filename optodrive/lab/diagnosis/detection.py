@@ -24,7 +24,14 @@ from optodrive.lab.diagnosis.fitting import (
     solve,
 )
 from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
-from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict, record
+from optodrive.lab.diagnosis.prediction import (
+    BASE_PARAMETERS,
+    ParameterPoint,
+    join_samples,
+    predict,
+    record,
+    simulate_records,
+)
 from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
@@ -126,12 +133,13 @@ def simulate_effects(
     fitted_columns = compute_jacobian(problem, base.point, base.free, base.prediction)
     starts: list[tuple[Hypothesis, dict[str, float]]] = []
     effects: list[FloatArray] = []
+    records = simulate_records(problem.data, base.point)
     for item in hypotheses:
         if item.label in log.failures:
             continue
         try:
             # A finite size: at size zero a time constant or a shape has no derivative.
-            changes = [_simulate_start(problem, base, item.key, start) for start in _select_starts(item)]
+            changes = [_simulate_start(problem, base, records, item.key, start) for start in _select_starts(item)]
         except UNCOMPUTABLE as error:
             log.add_failure(item.label, error)
             continue
@@ -141,15 +149,18 @@ def simulate_effects(
     return SimulatedEffects(tuple(starts), stacked, fitted_columns, sensitivity)
 
 
-def _simulate_start(problem: FitProblem, base: ModelFit, key: str, start: dict[str, float]) -> FloatArray:
-    """Return the change of the prediction [m] by a term beside a fit without it."""
+def _simulate_start(
+    problem: FitProblem, base: ModelFit, records: list[FloatArray], key: str, start: dict[str, float]
+) -> FloatArray:
+    """Return the change of the prediction [m] by a term beside a fit without it.
+
+    records: what the instruments record under the fit
+    """
     term = discover_terms()[key]
     if term.only_records and key not in base.point.terms:  # acts on what the other terms leave, which is known
-        signals = base.prediction.copy()
-        record(problem.data, term, start, signals)
+        signals = join_samples(problem.data, record(problem.data, term, start, records))
     else:
-        point = ParameterPoint(base.point.base, {**base.point.terms, key: start})
-        signals = predict(problem.data, point)
+        signals = predict(problem.data, ParameterPoint(base.point.base, {**base.point.terms, key: start}))
     return signals - base.prediction
 
 

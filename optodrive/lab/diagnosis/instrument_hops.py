@@ -15,7 +15,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import InstrumentDisturbance
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, SIGNALS, Block, BoolArray, Dataset
 from optodrive.lab.diagnosis.noise_model import NoiseModel, find_resolution, whiten
-from optodrive.lab.diagnosis.replicate_contrasts import Contrast, JitterSensitivity, compute_contrasts
+from optodrive.lab.diagnosis.replicate_contrasts import Contrast, JitterSensitivity, compute_contrasts, find_window
 
 HOP_WINDOWS, MIN_HOP_SAMPLES = (6, 24), 60
 SINGLE_HOP, PAIR_HOP, MORE_HOPS = 6.5, 5.5, 5.0
@@ -139,7 +139,10 @@ def _score_hops(contrasts: list[Contrast], noise: NoiseModel, resolutions: dict[
                 quick = _compute_changes(every[row], QUICK)[rows - QUICK] * np.sign(changes[row])
                 is_larger = ratio > scores[row].score[rows]
                 scores[row].score[rows[is_larger]] = ratio[is_larger]
-                is_abrupt = quick > HOP_ABRUPTNESS * np.abs(changes[row])
+                window = find_window(contrasts[row].t_s, noise.coloured[kind[0]].windows)
+                # Where a program averaged, no zero hops so fast; what it made of missing samples looks as if.
+                can_hop = window is None or window.count <= QUICK
+                is_abrupt = can_hop & (quick > HOP_ABRUPTNESS * np.abs(changes[row]))
                 scores[row].is_abrupt[rows[is_larger]] = is_abrupt[is_larger]
     return scores
 

@@ -162,7 +162,7 @@ def _build_synthetic_dataset(pulses: FloatArray, pixel: int, span_s: float, kind
     t_s = np.linspace(span_s / SAMPLES, span_s, SAMPLES)
     first, second, third = (t_s if kind in kinds else NEVER_S for kind in PIXEL_KINDS)
     experiment = PixelExperiment(pulses, pixel, 293.15, (first, second, third), dose_before=1.0, session_time=1.0)
-    samples = [Samples(0, kind, pixel, t_s, np.zeros(SAMPLES)) for kind in kinds]
+    samples = [Samples(0, kind, pixel, t_s, np.zeros(SAMPLES), t_s) for kind in kinds]
     return assemble_dataset((RunInfo("next", "next", 293.15, pulses, None),), samples, [(0, experiment)])
 
 

@@ -51,19 +51,16 @@ from optodrive.lab.diagnosis.replicate_contrasts import (
     find_window,
     find_windows,
 )
+from optodrive.lab.inspection.signal_faults import find_quantum
 
 EPS = 1e-12
 RESOLUTION_SHARE = 5e-5
 """Smallest noise relative to a signal's range: a 16-bit converter resolves 1.5e-5, and the closed form of the pixel and
 its integrator agree to 2e-5."""
-ROUNDING_SHARE = 1e-6
-"""Steps between samples below this share of the largest value are rounding errors, not quantisation."""
 ROUNDING_S = 0.02
 """Duration for which the rounding error of a settled signal without noise persists."""
 MAX_LAG = 40
 """Samples over which correlations of whitened samples are looked at."""
-MIN_QUANTA = 8
-"""Minimum number of steps between distinct samples for quantisation to be recognised."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +193,7 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, sensitivity: Jitte
             # guess.
             members = build_residual_contrasts(data, residual, sensitivity, kind)
         values, span = _collect_values(data, data.value - residual, kind)
-        quanta[kind] = _find_quantum(values)
+        quanta[kind] = find_quantum(values)
         coloured[kind] = _fit_coloured(members, estimate_resolution(values, span), windows)
     if not contrasts:
         # Without repeats jitters cannot be estimated; these are guesses.
@@ -252,7 +249,7 @@ def _minimize(function: Callable[[FloatArray], float], start: FloatArray, step: 
 
 def estimate_resolution(values: FloatArray, span: float) -> float:
     """Return the standard deviation that quantisation or a converter of that span gives to samples."""
-    return max(_find_quantum(values) / sqrt(12.0), RESOLUTION_SHARE * span, EPS)
+    return max(find_quantum(values) / sqrt(12.0), RESOLUTION_SHARE * span, EPS)
 
 
 def find_resolution(data: Dataset, kind: int) -> float:
@@ -265,17 +262,6 @@ def _collect_values(data: Dataset, prediction: FloatArray, kind: int) -> tuple[F
     parts = [block.part for block in data.blocks if block.kind == kind]
     values = np.concatenate([data.value[part] for part in parts])
     return values, max(float(np.ptp(values)), float(np.ptp(np.concatenate([prediction[part] for part in parts]))))
-
-
-def _find_quantum(values: FloatArray) -> float:
-    """Return the step of which all values are multiples, or 0 if there is none."""
-    values = np.unique(values)
-    steps = np.diff(values)
-    steps = steps[steps > ROUNDING_SHARE * float(np.abs(values).max())]
-    if len(steps) < MIN_QUANTA:
-        return 0.0
-    count = (values - values[0]) / steps.min()
-    return float(steps.min()) if float(np.abs(count - np.round(count)).max()) < 0.05 else 0.0
 
 
 def _fit_coloured(contrasts: list[Contrast], resolution: float, windows: Windows) -> ColouredNoise:

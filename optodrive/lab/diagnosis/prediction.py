@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.core.errors import DivergedError, Unquoted
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.servo import simulate_servo
-from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, PIXEL_KINDS, Dataset
+from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, NEVER_S, PIXEL_KINDS, Dataset
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.stability import check_time_constants
@@ -40,7 +40,18 @@ def predict(data: Dataset, point: ParameterPoint, power_factor: float = 1.0, del
 
     Raises DivergedError if a term is too fast for the integrator, a state leaves its range, or a sample is no number.
     """
-    out = np.zeros(len(data.value))
+    out = join_samples(data, simulate_records(data, point, power_factor, delay_s))
+    # One sample that is no number would make every χ² of this fit none.
+    if not np.isfinite(out).all():
+        raise DivergedError(", ".join(point.terms) or "the nominal model", Unquoted("no number"), "finite predictions")
+    return out
+
+
+def simulate_records(
+    data: Dataset, point: ParameterPoint, power_factor: float = 1.0, delay_s: float = 0.0
+) -> list[FloatArray]:
+    """Return what the instruments record of each block, at all times at which they sampled."""
+    out = [NEVER_S] * len(data.blocks)
     # All heat is proportional to the absorbed share, so a power factor needs no other pulses.
     pixel = point.pixel(power_factor)
     terms = [(all_terms()[key], values) for key, values in point.terms.items()]
@@ -52,35 +63,42 @@ def predict(data: Dataset, point: ParameterPoint, power_factor: float = 1.0, del
     # Repeats then differ, and each is integrated on its own.
     if any(term.varies_between_runs and not term.only_records for term, _ in terms):
         for experiment, numbers in data.experiments:
-            signals = simulate_signals(_time_truly(experiment, rates), pixel, active, delays_s[:3])
+            first, second, third = (data.blocks[number].sampled_s if number >= 0 else NEVER_S for number in numbers)
+            sampled = replace(experiment, t_s=(first, second, third))
+            signals = simulate_signals(_time_truly(sampled, rates), pixel, active, delays_s[:3])
             for kind in PIXEL_KINDS:
                 if numbers[kind] >= 0:
-                    out[data.blocks[numbers[kind]].part] = signals[kind]
+                    out[numbers[kind]] = signals[kind]
     else:
         for item in data.drive_groups:
             signals = simulate_signals(_time_truly(item.experiment, rates), pixel, active, delays_s[:3])
             for kind, number, rows in item.block_rows:
-                out[data.blocks[number].part] = signals[kind][rows]
+                out[number] = signals[kind][rows]
     servo = next((servo for term, values in terms if (servo := term.servo(values)) is not None), None)
-    for term, values in terms:
-        record(data, term, values, out)
-    for block in data.blocks:
+    for number, block in enumerate(data.blocks):
         commands = data.runs[block.run].commands
         if block.kind in MIRROR_KINDS and commands is not None:
             column = commands[:, 1 + MIRROR_KINDS.index(block.kind)]
-            t_s = block.t_s / (1.0 + rates.mirrors) - delays_s.mirrors
-            out[block.part] = simulate_servo(commands[:, 0], column, t_s, servo)
-    # One sample that is no number would make every χ² of this fit none.
-    if not np.isfinite(out).all():
-        raise DivergedError(", ".join(point.terms) or "the nominal model", Unquoted("no number"), "finite predictions")
+            t_s = block.sampled_s / (1.0 + rates.mirrors) - delays_s.mirrors
+            out[number] = simulate_servo(commands[:, 0], column, t_s, servo)
+    for term, values in terms:
+        out = record(data, term, values, out)
     return out
 
 
-def record(data: Dataset, term: Term, values: TermValues, signals: FloatArray) -> None:
-    """Replace the pixel's signals [m] by the record that instruments make of them under a term."""
-    for block, run in zip(data.blocks, data.recorded_runs, strict=True):
-        if block.kind in PIXEL_KINDS:
-            signals[block.part] = term.record(values, BySignal._fields[block.kind], block.t_s, signals[block.part], run)
+def record(data: Dataset, term: Term, values: TermValues, signals: list[FloatArray]) -> list[FloatArray]:
+    """Return the record that instruments make of each block's signal under a term."""
+    return [
+        term.record(values, BySignal._fields[block.kind], block.sampled_s, signal, run)
+        if block.kind in PIXEL_KINDS
+        else signal
+        for block, run, signal in zip(data.blocks, data.recorded_runs, signals, strict=True)
+    ]
+
+
+def join_samples(data: Dataset, signals: list[FloatArray]) -> FloatArray:
+    """Return the samples [m] that the data have of each block's signal."""
+    return np.concatenate([signal[block.rows] for block, signal in zip(data.blocks, signals, strict=True)])
 
 
 def _transpose(rows: list[BySignal]) -> Iterable[tuple[float, ...]]:

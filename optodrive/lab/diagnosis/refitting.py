@@ -12,6 +12,7 @@ from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_normal
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
+from optodrive.physics.terms import discover_terms
 
 CHI2_ABANDON = 300.0
 """A fit that is predicted to stay this far above the best χ² is abandoned."""
@@ -83,7 +84,9 @@ def refit_strongest(
             continue
         # By its score this hypothesis reaches a lower χ²: a fit that ends above it has missed its minimum.
         tolerance = max(CHI2_UNCONVERGED, UNCONVERGED_SHARE * score.ratio)
-        if _is_within_ranges(score) and result.chi2 > detection.residual_chi2 - score.ratio + tolerance:
+        has_missed = _is_within_ranges(score) and result.chi2 > detection.residual_chi2 - score.ratio + tolerance
+        # The effect of a filter is not proportional to its width, so its score says little about the best start.
+        if has_missed or (discover_terms()[score.hypothesis.key].only_records and not score.hypothesis.is_linear):
             result = _retry(problem, base, score.hypothesis, free, result)
         # The abandoned ones too: they count by the χ² at which they were left.
         fits.append((score, result))

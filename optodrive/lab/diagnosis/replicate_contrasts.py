@@ -73,11 +73,14 @@ def compute_contrasts(data: Dataset, residual: FloatArray, sensitivity: JitterSe
                 scale = sqrt(later / (later + 1.0))
                 weights = [*([scale / later] * later), -scale]
                 rows = [member.part.start + picked for member, picked in zip(members, common, strict=True)]
-                value = sum(w * residual[r] for w, r in zip(weights, rows, strict=True))
-                last, block, t_s = rows[-1], blocks[number, kind, pixel], members[-1].t_s[common[-1]]
+                times_s = [member.t_s[picked] for member, picked in zip(members, common, strict=True)]
+                last, block, t_s = rows[-1], blocks[number, kind, pixel], times_s[-1]
                 # With the mean residual, jitters act along the measured trace, also where the model misses it.
                 mean = np.mean([residual[r] for r in rows], axis=0)
                 missed = np.gradient(mean, t_s)
+                # Where runs are sampled at other phases, so much of the difference is what the model misses.
+                moved = [residual[r] - missed * (own_s - t_s) for r, own_s in zip(rows, times_s, strict=True)]
+                value = np.asarray(weights) @ np.array(moved)
                 power, timing = sensitivity.power[last] + mean, sensitivity.timing[last] - missed
                 jitter = np.stack([power, timing, np.ones(len(last))], axis=1)
                 contrasts.append(Contrast(pair, kind, block, t_s, value, jitter))
@@ -99,7 +102,7 @@ def _find_common_rows(first: FloatArray, others: list[FloatArray]) -> list[IntAr
     """Return the rows of each time axis that belong together, or None for fewer than 16.
 
     These are times that all axes share to 0.1 µs. Free-running instruments share none: then each sample belongs to the
-    nearest one of the first axis, within half an interval. What the residuals change by in this time counts as noise.
+    nearest one of the first axis, within half an interval, in which residuals change along their mean.
     """
     # Equality of floating-point times would fail in the last digit.
     keys = [np.round(times * 1e7).astype(np.int64) for times in (first, *others)]
@@ -164,12 +167,12 @@ def _count_smooth(members: list[tuple[float, FloatArray]]) -> int:
     while count < min(MAX_WINDOW, longest // 8):
         steps = (count, 2 * count)
         spreads = [
-            [float(np.mean((v[2 * step :] - 2.0 * v[step:-step] + v[: -2 * step]) ** 2)) for step in steps]
+            [float(np.median(np.abs(v[2 * step :] - 2.0 * v[step:-step] + v[: -2 * step]))) ** 2 for step in steps]
             for _, v in members
             if len(v) > 8 * count
         ]
         before, after = np.sum(spreads, axis=0)
-        if not after > MIN_GROWTH * before:
+        if not after > MIN_GROWTH * before > 0.0:
             break
         count *= 2
     return count

@@ -93,6 +93,20 @@ def _integrate_to(t_s: FloatArray, value: FloatArray, total: FloatArray, end_s: 
     return np.asarray(total[row] + 0.5 * (value[row] + last) * (end_s - t_s[row]))
 
 
+def mean_of_samples(t_s: FloatArray, value: FloatArray, width: float, late: float = 0.0) -> FloatArray:
+    """Return the mean [n] over samples of this number, around those that are late before each, as a program takes it.
+
+    Missing samples count as on a line between their neighbours. A part of a sample counts by its share.
+    """
+    steps = np.diff(t_s)
+    number = np.append(0, np.cumsum(np.maximum(np.round(steps / np.median(steps)), 1.0).astype(np.int64)))
+    every = np.arange(number[-1] + 1.0)
+    total = np.concatenate([[0.0], np.cumsum(np.interp(every, number, value))])
+    ends = [np.clip(every + 0.5 - late + side * 0.5 * width, 0.0, len(every)) for side in (-1.0, 1.0)]
+    before, after = (np.interp(end, np.arange(len(total)), total) for end in ends)
+    return np.asarray(((after - before) / np.maximum(ends[1] - ends[0], 1e-12))[number])
+
+
 @kernel
 def sensor_lag_sensor_lag(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """Add the thermometer's time constant, s."""
@@ -315,17 +329,20 @@ class Smoothing(Term):
         self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray, run: RecordedRun
     ) -> FloatArray:
         """Return the smoothed signal, [n]."""
-        width_s, order = values.get(signal, 0.0), values["order"]
+        width_s, order, late = values.get(signal, 0.0), values["order"], values["late"]
         if width_s <= 0.0 or len(t_s) < 2:
             return value
+        mean = value
         if values["by_samples"] > 0.5:
+            width = max(width_s / UNIT_INTERVAL_S, 1.0)
+            mean = mean_of_samples(t_s, value, width, late * width) if order < 1.0 else value
             width_s *= float(np.median(np.diff(t_s))) / UNIT_INTERVAL_S
-        late_s = values["late"] * width_s
-        mean = moving_mean(t_s, value, width_s, late_s) if order < 1.0 else value
+        elif order < 1.0:
+            mean = moving_mean(t_s, value, width_s, late * width_s)
         if order <= 0.0:
             return mean
         filtered = low_pass_both_ways(t_s, value, SAME_SPREAD * width_s, max(order, 1.0))
-        both = np.interp(t_s - late_s, t_s, filtered)
+        both = np.interp(t_s - late * width_s, t_s, filtered)
         return np.asarray(mean + min(order, 1.0) * (both - mean))
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, cont2discrete, filtfilt, lfilter
 
 from optodrive.physics.term import RecordedRun
 from optodrive.physics.terms import discover_terms
-from optodrive.physics.terms.sensor import low_pass, low_pass_both_ways, moving_mean
+from optodrive.physics.terms.sensor import low_pass, low_pass_both_ways, mean_of_samples, moving_mean
 
 T_S = np.arange(0.0, 0.5, 1e-3)
 SIGNAL = np.where(T_S > 0.1, 1.0 - np.exp(-(T_S - 0.1) / 0.03), 0.0)
@@ -63,6 +64,17 @@ def test_a_mean_of_samples_is_as_wide_as_its_samples_and_late_if_of_past_ones(in
     past = term.record(values | {"late": 7.0 / 15.0}, "displacement", t_s, signal, RecordedRun())
     assert past[inside] == pytest.approx(centred[13 : 13 + len(t_s) - 40], abs=4e-4)
     assert np.isfinite(past).all()
+
+
+@pytest.mark.parametrize(("count", "late"), [(7, 0), (15, 0), (15, 7), (29, 14)])
+def test_a_mean_of_samples_is_a_programs_exactly_with_missing_samples_on_a_line(count, late):
+    there = np.delete(np.arange(len(T_S)), [40, 101, 102, 103, 104, 105, 106, 250])
+    whole = np.interp(T_S, T_S[there], SIGNAL[there])
+    expected = uniform_filter1d(whole, count, origin=late)[there]
+    inside = slice(count, -count)
+    mean = mean_of_samples(T_S[there], SIGNAL[there], count, late)
+    assert mean[inside] == pytest.approx(expected[inside], abs=1e-12)
+    assert mean_of_samples(T_S[there], SIGNAL[there], 1.0) == pytest.approx(SIGNAL[there], abs=1e-12)
 
 
 def test_a_moving_mean_of_what_is_linear_is_itself():

@@ -9,7 +9,7 @@ from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.instrument_disturbances import find_dc_coupled, find_disturbances
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel
-from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity
+from optodrive.lab.diagnosis.replicate_contrasts import JitterSensitivity, NoiseWindow
 
 NOISE_M, NOISE_K = 2e-6, 0.2
 T_S = np.arange(600) / 2500.0
@@ -99,6 +99,19 @@ def test_hops_of_one_signal_are_found_and_removed():
     for block in data.blocks:
         expected = 1e-5 * (times_s[block.run] <= block.t_s) if block.kind == 1 and block.run in times_s else 0.0
         assert np.abs(added[block.part] - expected).mean() < 1.5e-6
+
+
+def test_what_a_mean_makes_of_a_missing_sample_is_no_hop():
+    averaged = replace(COLOURED[0], windows=(NoiseWindow(float(np.diff(T_S).mean()), 16),))
+
+    def add(number, rng):
+        return 0.0, 5.0 * ((T_S >= 0.11) & (T_S < 0.125)) * (number == 5)
+
+    data = build_dataset(build_runs(add))
+    nothing = JitterSensitivity(*2 * [np.zeros(len(data.value))])
+    for coloured, count in ((COLOURED[0], 1), (averaged, 0)):
+        noise = replace(NOISE, coloured=COLOURED | {0: coloured})
+        assert len(find_disturbances(data, data.value, nothing, noise)[0]) == count
 
 
 def test_a_hop_of_the_power_which_both_signals_show_is_not_the_instruments():

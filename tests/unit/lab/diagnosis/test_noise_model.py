@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, filtfilt
 
-from labs import PIXEL, lab
+from labs import AMBIENT_K, PIXEL, lab
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.servo import simulate_servo
 from optodrive.lab.diagnosis.dataset import build_dataset
@@ -183,6 +183,23 @@ def test_only_smooth_noise_is_averaged_over_its_length_for_each_interval(change,
         assert len(t_s) == -(-1500 // count)
         assert means[5] == pytest.approx(columns[kept][kept // count == 5].mean(axis=0))
         assert (np.diff(t_s) > 0.0).all()
+
+
+def test_repeats_at_other_phases_differ_by_no_more_than_the_noise_of_a_signal_that_the_model_misses():
+    rng, interval_s, runs = np.random.default_rng(4), 1e-3, []
+    for number in range(5):
+        t_s = interval_s * (np.arange(600) + (0.1, 0.36)[number % 2])
+        value = uniform_filter1d(rng.standard_normal(600), 29)
+        signal = Signal(0, t_s, AMBIENT_K + 120.0 * np.clip((t_s - 0.2) / 0.008, 0.0, 1.0) + value)
+        runs.append(
+            Run(f"r{number}", AMBIENT_K, np.zeros((0, 4)), {"absorber_temperature_K": signal}, {"group": "one"})
+        )
+    data = build_dataset(Measurement(tuple(runs)))
+    nothing = JitterSensitivity(*2 * [np.zeros(len(data.value))])
+    contrasts = compute_contrasts(data, data.value, nothing)
+    assert [item.count for item in find_windows(contrasts)] == [32]
+    for item in contrasts:  # beside the kinks of the ramp, where the slope is not that of its neighbours
+        assert np.abs(item.value[(item.t_s > 0.2025) & (item.t_s < 0.2055)]).max() < 1.0
 
 
 @pytest.mark.parametrize("change", [lambda value, rate: uniform_filter1d(value, 21, origin=10), smooth_twice])
