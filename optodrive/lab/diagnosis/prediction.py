@@ -50,7 +50,7 @@ def predict(data: Dataset, point: ParameterPoint, power_factor: float = 1.0, del
 def simulate_records(
     data: Dataset, point: ParameterPoint, power_factor: float = 1.0, delay_s: float = 0.0
 ) -> list[FloatArray]:
-    """Return what the instruments record of each block, at all times at which they sampled."""
+    """Return the records of all blocks at all times of samples."""
     out = [NEVER_S] * len(data.blocks)
     # All heat is proportional to the absorbed share, so a power factor needs no other pulses.
     pixel = point.pixel(power_factor)
