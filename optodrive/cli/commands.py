@@ -49,6 +49,9 @@ MODULES = {
 }
 """Commands by module below `optodrive.cli`, in the order of the help: its functions of these names, or its GROUP."""
 
+DEFAULTS = {"study": "run"}
+"""Groups with a command that also runs without its name."""
+
 UNCONDITIONAL = ("stop", "support")
 """Commands that a wrong environment does not prevent: what makes dark, and what reports."""
 
@@ -63,6 +66,7 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
     invocation = Invocation(tuple(arguments), stopped)
     command = arguments[0] if arguments else None
     root = typer.main.get_command(build_app(command))
+    arguments = name_default(root, arguments)
     try:
         if command not in UNCONDITIONAL:
             check_environment()
@@ -92,6 +96,15 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
             return 0  # the reader of stdout has exited
         print(f"optodrive: {error}", file=sys.stderr)
         return 1
+
+
+def name_default(root: Any, arguments: list[str]) -> list[str]:
+    """Return the arguments with the name of the group's default command, if another word than a command follows."""
+    group, rest = arguments[:1], arguments[1:]
+    default = DEFAULTS.get(group[0]) if group else None
+    if default is None or not rest or rest[0] in (*root.commands[group[0]].commands, "--help"):
+        return arguments
+    return [*group, default, *rest]
 
 
 def _refuse_repeated_option(command: Any, arguments: list[str]) -> None:

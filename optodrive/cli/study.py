@@ -1,4 +1,7 @@
-"""`optodrive study`: run a study with people, or with simulated participants in virtual time."""
+"""`optodrive study run | report`: run a study with people or simulated participants, and judge its dataset.
+
+`optodrive study STUDY` is short for `optodrive study run STUDY`.
+"""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -32,8 +35,13 @@ STUDY_HELP = (
     "roughness, temporal-order, two-point."
 )
 
+GROUP = typer.Typer(
+    help="Run a study (`study STUDY`, or `study run STUDY`), and judge its trials.", no_args_is_help=True
+)
 
-def study(
+
+@GROUP.command()
+def run(
     source: Annotated[str, typer.Argument(metavar="STUDY", help=STUDY_HELP)],
     out: Annotated[
         Path, typer.Option("--out", metavar="FOLDER", help="Dataset (BIDS); a session begun in it goes on.")
@@ -126,6 +134,37 @@ def study(
     if design.matching is not None and display_config is not None:
         report["sensitivity"] = _write_sensitivity(design, design.matching, sessions, out, display_config)
     print_answer(report, _format_report(report), json)
+
+
+@GROUP.command()
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Dataset (BIDS) that a study has written.")],
+    json: JsonOption = False,
+) -> None:
+    """Judge the trials of a dataset by its tables alone. Write a page, a table and the numbers of each study to it.
+
+    They are FOLDER/derivatives/task-NAME_report.html, _trials.tsv and _report.json.
+    """
+    from json import dumps
+
+    from optodrive.core.files import create_folder, write_text
+    from optodrive.core.provenance import Provenance
+    from optodrive.study.report import StudyResults
+    from optodrive.study.trial_table import read_tables
+
+    provenance = Provenance.capture(["study", "report", str(folder)], [str(folder)])
+    documents, lines = {}, list[str]()
+    for table in read_tables(folder):
+        results = StudyResults(table)
+        stem = folder / "derivatives" / f"task-{table.task}"
+        create_folder(stem.parent)
+        documents[table.task] = results.to_document()
+        write_text(stem.with_name(f"{stem.name}_report.html"), results.to_html(provenance))
+        write_text(stem.with_name(f"{stem.name}_trials.tsv"), table.format())
+        numbers = documents[table.task] | {"provenance": provenance.to_dict()}
+        write_text(stem.with_name(f"{stem.name}_report.json"), dumps(numbers, indent=2, ensure_ascii=False) + "\n")
+        lines += [*results.list_lines(), f"written: {stem}_report.html, _report.json, _trials.tsv"]
+    print_answer(documents, lines, json)
 
 
 def _load_display_config(design: "Study", participant: str | None, url: str, config: str | None) -> "Config | None":
@@ -330,22 +369,29 @@ def _call_all(listeners: Sequence[Callable[[dict[str, Any]], None]], record: dic
 
 def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], out: Path) -> dict[str, Any]:
     from optodrive.study.results import Accuracy, count_correct, fit_magnitudes, list_thresholds
+    from optodrive.study.trial_list import find_exclusion, find_session_exclusion
 
     published = design.published
-    sessions = {name: [one for one in records if one["phase"] == "main"] for name, records in sessions.items()}
-    records = [record for session in sessions.values() for record in session]
+    main = {name: [one for one in records if one["phase"] == "main"] for name, records in sessions.items()}
+    sessions = {
+        name: [one for one in main[name] if not excluded and find_exclusion(design, one) is None]
+        for name, records in sessions.items()
+        for excluded in [find_session_exclusion(design, records)]
+    }
+    shown, records = [[record for session in each.values() for record in session] for each in (main, sessions)]
     report: dict[str, Any] = {
         "study": design.name,
-        "participants": {name: len(session) for name, session in sessions.items()},
-        "trials": len(records),
-        "stimuli_per_trial": sum(len(record["presentations"]) for record in records) / len(records),
-        "repeated": sum(record["attempt"] > 1 for record in records),
+        "participants": {name: len(session) for name, session in main.items()},
+        "trials": len(shown),
+        "excluded": len(shown) - len(records),
+        "stimuli_per_trial": sum(len(record["presentations"]) for record in shown) / len(shown),
+        "repeated": sum(record["attempt"] > 1 for record in shown),
         "chance_level": design.response.chance_level,
     }
-    if design.response.rules:
-        counted = count_correct(records)
+    counted = count_correct(records)
+    if design.response.rules and counted.trials:
         report |= {"correct": counted.correct, "judged": counted.trials, "accuracy": counted.share}
-    elif design.response.kind == "magnitude" and len(design.factors) == 1:
+    elif design.response.kind == "magnitude" and len(design.factors) == 1 and all(sessions.values()):
         report["line"] = fit_magnitudes(design, list(sessions.values()))._asdict()
     if design.procedure is not None:
         report["threshold_of"] = design.procedure.parameter
@@ -365,6 +411,8 @@ def _format_report(report: dict[str, Any]) -> Iterator[str]:
     yield f"participants     {len(participants)}, {report['trials']} trials in all"
     if report["repeated"]:
         yield f"repeated         {report['repeated']} trials whose first attempt was interrupted or spoiled"
+    if report["excluded"]:
+        yield f"excluded         {report['excluded']} trials by the rules of the study"
     if "accuracy" in report:
         yield (
             f"correct          {report['correct']} of {report['judged']}, {100 * report['accuracy']:.1f} % "

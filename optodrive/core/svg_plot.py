@@ -33,18 +33,30 @@ class Series:
 class Axis:
     """Axis with its quantity and unit, SI.
 
-    half_band: half the width of a band about zero, 0 for none
+    half_band: half the width of a band about zero, 0 for none; is_logarithmic: of positive values
     """
 
     quantity: str
     unit: str
     half_band: float = 0.0
+    is_logarithmic: bool = False
 
 
 class Scale:
-    """Linear map from values to picture coordinates, with ticks at round numbers of the prefixed unit."""
+    """Map from values to picture coordinates, with ticks at round numbers of the prefixed unit."""
 
     def __init__(self, axis: Axis, low: float, high: float, start: float, end: float) -> None:
+        self._is_logarithmic = axis.is_logarithmic
+        if axis.is_logarithmic:
+            self._start, self._length, self.label = start, end - start, axis.quantity
+            self._low, self._span = log10(low), log10(high / low) or 1.0
+            powers = range(floor(log10(low)), ceil(log10(high)) + 1)
+            factors = (1.0, 2.0, 5.0) if high < 1000.0 * low else (1.0,)
+            round_numbers = [factor * 10.0**power for power in powers for factor in factors]
+            self.ticks = [
+                (self.place(x), f"{x:g}") for x in round_numbers if low * (1 - 1e-9) <= x <= high * (1 + 1e-9)
+            ]
+            return
         self._low, self._span, self._start, self._length = low, (high - low) or 1.0, start, end - start
         factor, unit = select_scale(max(abs(low), abs(high)), axis.unit)
         self.label = f"{axis.quantity}, {unit}" if unit not in ("", "1") else axis.quantity
@@ -55,10 +67,12 @@ class Scale:
 
     def place(self, value: float) -> float:
         """Return the coordinate of a value."""
+        value = log10(value) if self._is_logarithmic else value
         return self._start + (value - self._low) / self._span * self._length
 
     def place_all(self, values: FloatArray) -> FloatArray:
         """Return the coordinates of values, [n]."""
+        values = np.log10(values) if self._is_logarithmic else values
         return self._start + (values - self._low) / self._span * self._length
 
 

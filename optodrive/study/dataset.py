@@ -284,6 +284,7 @@ def _describe_task(study: Study) -> dict[str, Any]:
         "Analysis": {
             "GuessRate": response.chance_level,
             "Level": None if study.procedure is None else study.procedure.parameter,
+            "EqualInterval": None if study.procedure is None else study.procedure.equal_interval,
             "Factors": [name for name in study.varied if study.procedure is None or name != study.procedure.parameter],
         },
         "StimulusPresentation": {"SoftwareName": "optodrive", "SoftwareVersion": version("optodrive")},

@@ -80,8 +80,8 @@ EXPLANATIONS = {
     Flag.EXCHANGED_KEYS: "fewer answers are correct than by guessing: exchanged keys?",
     Flag.GUESSING: "the answers do not depend on the level: guesses, or every level lies below the threshold",
     Flag.LAPSES: f"more than {100 * LAPSE_RANGE[1]:g} % of the answers at high levels seem to be lapses",
-    Flag.BELOW_LEVELS: "the threshold may lie below the lowest level, where the study does not measure it",
-    Flag.ABOVE_LEVELS: "the threshold may lie above the highest level, where the study does not measure it",
+    Flag.BELOW_LEVELS: "the threshold may lie below the tested levels, where the study does not measure it",
+    Flag.ABOVE_LEVELS: "the threshold may lie above the tested levels, where the study does not measure it",
 }
 
 
@@ -132,11 +132,18 @@ class ThresholdModel:
     @cached_property
     def correct(self) -> FloatArray:
         """Probability of a correct answer at each level and grid point, [l, t × s × h]."""
+        return self._compute_shares(self.levels)
+
+    def _compute_shares(self, levels: Sequence[float]) -> FloatArray:
         slopes, (guesses, lapses, _) = np.geomspace(*SLOPE_RANGE, SLOPES), self._habits.T
-        log_level = np.log(self.levels)[:, None, None, None]
+        log_level = np.log(levels)[:, None, None, None]
         drive = np.exp(slopes[:, None] * (log_level - self.log_thresholds[:, None, None]))
         share = guesses + (1.0 - guesses - lapses) * -np.expm1(-drive)
-        return np.asarray(np.minimum(share, CORRECT_MAX).reshape(len(self.levels), -1), dtype=np.float64)
+        return np.asarray(np.minimum(share, CORRECT_MAX).reshape(len(levels), -1), dtype=np.float64)
+
+    def compute_curve(self, answered: Answered, levels: Sequence[float]) -> FloatArray:
+        """Return the expected share of correct answers at levels [l] after answers."""
+        return np.asarray(self._compute_shares(levels) @ self.compute_posterior(answered), dtype=np.float64)
 
     @cached_property
     def _outcomes(self) -> tuple[tuple[FloatArray, FloatArray], ...]:

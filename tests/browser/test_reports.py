@@ -9,6 +9,9 @@ from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer
 from optodrive.lab.diagnosis.display_report import build_display_report
 from optodrive.lab.diagnosis.report import build_report
+from optodrive.study.report import StudyResults
+from optodrive.study.trial_table import read_tables
+from study_tables import write_thresholds
 from window import PHONE, WIDE, list_violations
 
 DROOP = {"laser_droop": {"share": 0.08, "time": 0.05, "spread": 1.0}}
@@ -16,7 +19,8 @@ PROVENANCE = Provenance.capture(["diagnose", "a-recording-with-a-long-name.h5"],
 
 
 @pytest.fixture(scope="module")
-def reports():
+def reports(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("study")
     found = diagnose(lab(12, DROOP, groups=("short", "weak", "middle", "strong")))
     assert found.verdict == "cause"
     assert found.held_out_traces
@@ -24,11 +28,12 @@ def reports():
     config = load_config("display-16")
     return {
         "one": build_report(found, "a-recording-with-a-long-name.h5", PROVENANCE),
+        "study": StudyResults(read_tables(write_thresholds(folder))[0]).to_html(PROVENANCE),
         "display": build_display_report(DisplayAnswer(pixels, None, 1.0), "film.h5", config, PROVENANCE),
     }
 
 
-@pytest.mark.parametrize("name", ["one", "display"])
+@pytest.mark.parametrize("name", ["one", "display", "study"])
 def test_axe_finds_nothing_and_nothing_sticks_out(browser, axe, reports, name, tmp_path):
     path = tmp_path / "report.html"
     path.write_text(reports[name], encoding="utf-8")

@@ -25,7 +25,7 @@ from worlds import (
     write_stimuli,
 )
 
-from optodrive.cli.commands import UsageError, build_app
+from optodrive.cli.commands import UsageError, build_app, name_default
 
 ELSEWHERE = {
     "scripts/": "scripts of the checkout, which are run as they are",
@@ -87,6 +87,7 @@ SCENARIOS = {
     ),
     "discovery": (write_motor, ["docs/how-to/discover-a-term.md:Find what a simulation lacks"]),
     "discovery-in-a-pixel": (write_slack, ["docs/how-to/discover-a-term.md:In a pixel"]),
+    "analysis": (write_checkout, ["docs/how-to/analyse-a-study.md:The report"]),
     "film": (write_film, ["docs/explanation/diagnosis.md:Whole displays"]),
     "recordings": (write_recordings, ["docs/reference/recordings.md:Recordings"]),
     "recordings-python": (write_film, ["docs/reference/recordings.md:From Python"]),
@@ -198,6 +199,7 @@ def test_a_difference_is_found(shown, real):
 def parse(words):
     """Parse the arguments of a command without running it."""
     command, name = typer.main.get_command(build_app()), "optodrive"
+    words = name_default(command, list(words))
     parent = None
     while True:
         context = command.make_context(name, list(words), parent=parent, resilient_parsing=False)

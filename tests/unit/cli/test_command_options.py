@@ -8,7 +8,7 @@ from enum import EnumType
 import pytest
 from typer.main import get_command
 
-from optodrive.cli.commands import build_app
+from optodrive.cli.commands import DEFAULTS, build_app
 from optodrive.cli.main import run
 from optodrive.client import Display
 from optodrive.core.daemon_url import ENVIRONMENT_VARIABLES
@@ -69,10 +69,18 @@ def test_an_option_given_twice_is_refused(path, command, capsys):
         assert (status, capsys.readouterr().err) == (2, refusal)
 
 
-@pytest.mark.parametrize("group", sorted(GROUPS))
+@pytest.mark.parametrize("group", sorted(GROUPS - {(name,) for name in DEFAULTS}))
 def test_an_unknown_command_is_refused_by_name(group, capsys):
     assert run([*group, "surely-unknown"]) == 2
     assert "No such command 'surely-unknown'" in capsys.readouterr().err
+
+
+def test_a_group_takes_another_word_for_the_argument_of_its_default_command(capsys, tmp_path):
+    for words in (["study"], ["study", "run"]):
+        assert run([*words, "surely-unknown", "--out", str(tmp_path / "data")]) == 2
+        assert capsys.readouterr().err.startswith("optodrive: study: got 'surely-unknown', expected a file, or ")
+        assert run([*words, "detection", "--out", "a", "--out", "b"]) == 2
+        assert capsys.readouterr().err == "optodrive: --out: got 'b', expected each option once\n"
 
 
 def test_the_client_has_a_dry_run_where_a_command_has_one():
