@@ -100,7 +100,7 @@ class ParticipantView(JsonModel):
     trial: number of the present or next trial within practice or the other trials, from 1; trials: number of the others
     example: number of the example and of all; announced: the presentation that answers are about
     is_early: there was an answer before the stimulus had ended; answered: the answer that was noted last
-    has_missed: there was no answer in time; is_last: no stimulus comes any more
+    has_missed: there was no answer in time; follows: what comes after a trial, None until that is known
     is_correct, correct: feedback to the last answer; is_begun: the participant was ready before
     texts: the sentences of the page by key
     """
@@ -120,7 +120,7 @@ class ParticipantView(JsonModel):
     trial: int
     trials: int
     has_missed: bool
-    is_last: bool
+    follows: Literal["stimulus", "break", "end"] | None
     is_correct: bool | None
     correct: str | None
     example: tuple[int, int] | None

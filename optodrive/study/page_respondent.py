@@ -36,10 +36,10 @@ from optodrive.study.page_messages import (
     TrialRow,
 )
 from optodrive.study.presenter import Presentation
-from optodrive.study.session import RepeatReason, Respondent, Response
+from optodrive.study.session import Follows, RepeatReason, Respondent, Response
 from optodrive.study.study_file import Study
 from optodrive.study.study_sections import QuestionSection, Value
-from optodrive.study.trial_list import ListedTrial
+from optodrive.study.trial_list import ListedTrial, is_practice_over
 
 INPUTS_MAX = 100
 """Answers that are kept from the announcement of a stimulus to its end. Further ones are dropped."""
@@ -67,8 +67,8 @@ class PageRespondent(Respondent):
         self._study, self._participant, self._texts = study, participant, study.page_texts
         counted = [record for record in trials.values() if record["phase"] == "main"]
         self._answered, self._correct = len(counted), sum(bool(record["is_correct"]) for record in counted)
-        self._practised = len(trials) - len(counted)
-        self._is_practice = study.practice is not None and not counted
+        self._practised = [record for record in trials.values() if record["phase"] == "practice"]
+        self._is_practice = not is_practice_over(study, self._practised)
         self._rows = [_build_row(trials[index]) for index in sorted(trials)[-ROWS_MAX:]]
         self._changed = threading.Condition()
         self._connection = 0
@@ -85,7 +85,8 @@ class PageRespondent(Respondent):
         self._inputs: list[_Input] = []
         self._early_answers = 0
         self._noted: str | float | None = None
-        self._has_missed = self._is_last = False
+        self._has_missed = False
+        self._follows: Follows | None = "stimulus"
         self._executed: Executed | None = None
         self._halt: str | None = None
         self._outcome: Phase | None = None
@@ -116,7 +117,8 @@ class PageRespondent(Respondent):
     def take_break(self, text: str | None) -> None:
         """Let the participant rest, and wait for the button before the next stimulus."""
         with self._changed:
-            self._instructions = text
+            self._instructions, self._noted, self._has_missed = text, None, False
+            self._follows, self._feedback = "stimulus", (None, None)
             self._interrupt()
 
     def fill_in(self, questions: Sequence[QuestionSection]) -> dict[str, Any]:
@@ -131,10 +133,10 @@ class PageRespondent(Respondent):
             self._notify()
             return self._forms[0]
 
-    def show_feedback(self, is_correct: bool | None, correct: str | None) -> None:
-        """Show whether the last answer was correct until the next stimulus."""
+    def conclude(self, follows: Follows, is_correct: bool | None, correct: str | None) -> None:
+        """Show the feedback to the last answer and the next step until the next stimulus."""
         with self._changed:
-            self._feedback = is_correct, correct
+            self._follows, self._feedback = follows, (is_correct, correct)
             self._notify()
 
     def announce(
@@ -144,8 +146,7 @@ class PageRespondent(Respondent):
         with self._changed:
             self._announced = PresentationKey(trial=trial, attempt=attempt, presentation=presentation)
             self._listed, self._is_practice = listed, listed.phase == "practice"
-            self._has_missed = self._is_last = False
-            self._feedback = None, None
+            self._has_missed, self._follows, self._feedback = False, None, (None, None)
             self._condition, self._executed, self._noted, self._example = dict(condition), None, None, None
             self._is_open, self._inputs = False, []
             self._is_interrupted = not self._is_ready
@@ -157,7 +158,7 @@ class PageRespondent(Respondent):
         """Drop the announced stimulus and its answers."""
         with self._changed:
             self._notice = f"trial {self._find_trial_number()} is repeated: {fault}"
-            self._announced = None
+            self._announced, self._follows = None, "stimulus"
             self._notify()
 
     def respond(self, shown: Presentation, trial: int, attempt: int) -> Response | RepeatReason:
@@ -185,13 +186,13 @@ class PageRespondent(Respondent):
                 found = None
             self._announced = None
             if found is not None and found.answer is not None:
-                self._noted, self._is_last = found.answer, self._is_last_of_all()
+                self._noted = found.answer
                 self._notify()
                 latency_s = None if found.latency_s is None else round(found.latency_s, 6)
                 return Response(found.answer, round(found.arrived_s - end_s, 6), latency_s, self._early_answers)
             self._raise_if_halted()
             if found is None and not self._is_interrupted:
-                self._has_missed, self._is_last = True, self._is_last_of_all()
+                self._has_missed = True
                 self._notify()
                 return Response(None, None, None, self._early_answers)
             self._notify()
@@ -204,7 +205,8 @@ class PageRespondent(Respondent):
                 self._answered += 1
                 self._correct += bool(record["is_correct"])
             else:
-                self._practised += 1
+                self._practised.append(record)
+                self._is_practice = not is_practice_over(self._study, self._practised)
             self._rows = [*self._rows, _build_row(record)][-ROWS_MAX:]
             self._notice = ""
             self._notify()
@@ -295,7 +297,7 @@ class PageRespondent(Respondent):
                 trial=self._find_trial_number(),
                 trials=study.trial_count,
                 has_missed=self._has_missed,
-                is_last=self._is_last,
+                follows=self._follows,
                 is_correct=self._feedback[0],
                 correct=self._feedback[1],
                 example=self._example,
@@ -377,17 +379,13 @@ class PageRespondent(Respondent):
             return "example"
         return "pause" if self._is_paused else "rest"
 
-    def _is_last_of_all(self) -> bool:
-        """Return whether no stimulus comes after the present one, once it is answered."""
-        return not self._is_practice and self._answered + 1 == self._study.trial_count
-
     def _find_trial_number(self) -> int:
         """Return the number of the present or next trial within practice, or within the other trials."""
         before = 0 if self._study.practice is None else self._study.practice.count_max
         if self._announced is not None:
             return self._announced.trial + 1 - (0 if self._is_practice else before)
         if self._is_practice:
-            return self._practised + 1
+            return len(self._practised) + 1
         return min(self._answered + 1, self._study.trial_count)
 
 

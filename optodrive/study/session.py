@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -42,6 +42,10 @@ class Response:
     early_answers: int | None = None
 
 
+Follows = Literal["stimulus", "break", "end"]
+"""What comes after a trial: its end is that of the last one."""
+
+
 class RepeatReason(StrEnum):
     """Why a stimulus is shown once more before its trial is answered."""
 
@@ -65,8 +69,8 @@ class Respondent:
     ) -> None:
         """Tell that a trial's stimulus comes. presentation: its number within the attempt, from 1."""
 
-    def show_feedback(self, is_correct: bool | None, correct: str | None) -> None:
-        """Tell whether the answer was correct, and the correct one, if there is one."""
+    def conclude(self, follows: Follows, is_correct: bool | None, correct: str | None) -> None:
+        """Tell the next step after a trial, and the feedback: whether the answer was correct, and the correct one."""
 
     def instruct(self, text: str | None) -> None:
         """Show instructions before the first stimulus of a run."""
@@ -196,22 +200,23 @@ def run_session(
     _ask(study, log, respondent, "before")
     if study.familiarisation and not log.is_familiarised:
         log.record_familiarisation(_familiarise(study, presenter, respondent))
-    before, since_break = None, 0
-    while (index := log.next_trial) is not None:
+    index, since_break = log.next_trial, 0
+    while index is not None:
         listed = log.order[index]
-        if before is not None and listed.block != before.block:
-            respondent.take_break(find_instructions(study, listed))
-            since_break = 0
-        elif study.break_every is not None and since_break == study.break_every:
-            respondent.take_break(None)
-            since_break = 0
         record = _run_trial(study, log, presenter, respondent, index, matching)
         on_trial(record)
+        index, since_break = log.next_trial, since_break + 1
+        following = None if index is None else log.order[index]
+        is_other_block = following is not None and following.block != listed.block
+        is_break = is_other_block or (following is not None and since_break == study.break_every)
         practice = study.practice if listed.phase == "practice" else None
-        if study.response.feedback if practice is None else practice.feedback:
-            respondent.show_feedback(record["is_correct"], record["correct_answer"])
+        has_feedback = study.response.feedback if practice is None else practice.feedback
+        feedback = (record["is_correct"], record["correct_answer"]) if has_feedback else (None, None)
+        respondent.conclude("end" if following is None else "break" if is_break else "stimulus", *feedback)
         presenter.wait(study.pause_s)
-        before, since_break = listed, since_break + 1
+        if following is not None and is_break:
+            respondent.take_break(find_instructions(study, following) if is_other_block else None)
+            since_break = 0
     _ask(study, log, respondent, "after")
 
 

@@ -7,7 +7,7 @@ from math import isfinite
 from typing import Any
 
 from optodrive.study.presenter import Presentation
-from optodrive.study.session import RepeatReason, Respondent, Response
+from optodrive.study.session import Follows, RepeatReason, Respondent, Response
 from optodrive.study.study_file import Study
 from optodrive.study.study_sections import QuestionSection, Value
 from optodrive.study.trial_list import ListedTrial
@@ -62,8 +62,9 @@ class TerminalRespondent(Respondent):
         else:
             self._number = f"{trial + 1 - before} / {self._study.trial_count}"
 
-    def show_feedback(self, is_correct: bool | None, correct: str | None) -> None:
+    def conclude(self, follows: Follows, is_correct: bool | None, correct: str | None) -> None:
         """Say whether the answer was correct."""
+        del follows
         if is_correct is not None:
             label = dict(zip(self._study.response.answers, self._readable, strict=True)).get(str(correct), correct)
             self._say(fill_text(self._texts, "correct" if is_correct else "wrong", answer=label) + "\n")

@@ -75,13 +75,14 @@ function describe({ phase, is_begun: isBegun, is_early: isEarly, example }) {
 }
 
 // What became of the last answer, and what comes next.
-function describeRest({ answered, has_missed: hasMissed, is_correct: isCorrect, correct, is_last: isLast }) {
+function describeRest({ answered, has_missed: hasMissed, is_correct: isCorrect, correct, follows }) {
   return [
     answered !== null && sayText("answered", { answer: findLabel(answered) }),
     hasMissed && sayText("no_answer"),
     isCorrect === true && sayText("correct"),
     isCorrect === false && sayText("wrong", { answer: findLabel(correct) }),
-    !isLast && sayText("next"),
+    follows === "stimulus" && sayText("next"),
+    follows === "break" && sayText("break_next"),
   ]
     .filter(Boolean)
     .join(" ");
@@ -110,7 +111,7 @@ function onView({ view: number, ...newest }) {
   show(phase, state, hint);
   find("progress-text").textContent = describeProgress(view);
   find("progress-bar").max = trials;
-  find("progress-bar").value = phase === "done" || view.is_last ? trials : view.is_practice ? 0 : trial - 1;
+  find("progress-bar").value = phase === "done" || view.follows === "end" ? trials : view.is_practice ? 0 : trial - 1;
   document.title = `${view.title}: ${state}`;
   find("question").textContent = view.question;
   showInstructions(phase);
@@ -136,7 +137,7 @@ function showTexts() {
 
 function showInstructions(phase) {
   const paragraphs = (view.instructions ?? "").split(/\n\s*\n/).filter(Boolean);
-  find("instructions").hidden = !["start", "form"].includes(phase) || paragraphs.length === 0;
+  find("instructions").hidden = phase !== "start" || paragraphs.length === 0;
   find("instructions").replaceChildren(
     ...paragraphs.map((text) => Object.assign(document.createElement("p"), { textContent: text.trim() })),
   );
@@ -148,8 +149,8 @@ function show(phase, state, hint) {
   find("hint").textContent = hint;
   find("begin").hidden = phase !== "start";
   find("by-keys").hidden = ["done", "stopped", "lost", "form"].includes(phase);
-  find("task").hidden = !DURING.includes(phase) || view?.is_last;
-  find("break").hidden = ![...DURING, "example"].includes(phase) || view?.is_last;
+  find("task").hidden = !DURING.includes(phase) || view?.follows === "end";
+  find("break").hidden = ![...DURING, "example"].includes(phase) || view?.follows === "end";
   if (phase !== "form") {
     find("form").hidden = true;
   }
@@ -157,7 +158,10 @@ function show(phase, state, hint) {
 
 // Each state is said once, with its trial and, where there is one, the question.
 function say(phase, state, hint) {
-  const { trial, is_practice: isPractice } = view;
+  const { trial, is_practice: isPractice, follows } = view;
+  if (phase === "rest" && follows === null) {
+    return; // what follows is not known yet: it is said with the answer
+  }
   const parts = { stimulus: `${describeProgress(view)}. ${state}.`, question: `${state}. ${view.is_early ? `${hint} ` : ""}${view.question}` };
   const text = parts[phase] ?? `${/[.?!]$/.test(state) ? state : `${state}.`} ${hint}`;
   if (`${isPractice} ${trial} ${text}` !== said) {
@@ -172,6 +176,8 @@ function keepFocus(phase) {
   const focused = document.activeElement;
   if (phase === "start") {
     find("begin").focus();
+  } else if (phase === "question" && view.kind === "number") {
+    find("number").focus();
   } else if (focused === document.body || !focused.checkVisibility()) {
     find("state").focus();
   }
