@@ -39,7 +39,7 @@ SECTION = """## {title}
 
 ![The parts, each pin with its net](../pictures/circuit-{name}.svg)
 
-{pins}
+{difference}{pins}
 
 {remark}
 
@@ -48,6 +48,10 @@ SECTION = """## {title}
 {count} single faults, none of them leaves the laser on:
 
 {faults}
+"""
+
+DIFFERENCE = """Rows of pins and parts that are those of {title} are left out here. The parts {missing} are not needed.
+
 """
 
 TITLES = {"analog": "Analog", "xy2-100": "XY2-100"}
@@ -73,7 +77,8 @@ def build_fault_table(outcomes: list[Outcome]) -> str:
     ordered = sorted(outcomes, key=lambda outcome: (*_group(outcome), outcome.fault))
     for (follows, shown), group in groupby(ordered, key=_group):
         names = [outcome.fault.removeprefix("wire ").partition(" (")[0] for outcome in group]
-        rows.append(f"| {follows} | {shown} | {len(names)}: {', '.join(names)} |")
+        listed = ", ".join(names) if 2 * len(names) < len(outcomes) else "all others"
+        rows.append(f"| {follows} | {shown} | {len(names)}: {listed} |")
     return "\n".join(rows)
 
 
@@ -82,15 +87,24 @@ def _build_section(circuit: Circuit) -> str:
     exposed = [outcome.fault for outcome in outcomes if not outcome.is_dark]
     if exposed:
         raise RuntimeError(f"{circuit.name}: the laser may be on after: {', '.join(exposed)}")
+    first = next(iter(CIRCUITS.values()))
+    missing = [reference for reference in first.parts if reference not in circuit.parts]
     return SECTION.format(
         name=circuit.name,
         title=TITLES[circuit.name],
+        difference="" if circuit is first else DIFFERENCE.format(title=TITLES[first.name], missing=", ".join(missing)),
         remark=REMARKS[circuit.name],
-        pins=build_pin_table(circuit),
-        parts=build_parts_list(circuit),
+        pins=_leave_out(build_pin_table(circuit), "" if circuit is first else build_pin_table(first)),
+        parts=_leave_out(build_parts_list(circuit), "" if circuit is first else build_parts_list(first)),
         faults=build_fault_table(outcomes),
         count=len(outcomes),
     )
+
+
+def _leave_out(table: str, other: str) -> str:
+    """Return a table without the rows that another one has too."""
+    known = set(other.splitlines()[2:])
+    return "\n".join(row for row in table.splitlines() if row not in known)
 
 
 def build_page() -> str:
