@@ -1,6 +1,7 @@
 """Write the reference pages that follow from the code: configuration, terms, REST, streams."""
 
 import json
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -86,13 +87,19 @@ def format_default(info: FieldInfo) -> str:
     )
 
 
+def describe(name: str, texts: dict[str, str]) -> str:
+    """Return a key's description in one line, without the unit that its name ends in."""
+    unit = {"s": "s", "m": "m", "c": "°C", "w": "W", "j": "J", "hz": "Hz", "rad": "rad"}.get(name.rpartition("_")[2])
+    return re.sub(rf", {unit}(?=[.;,:])", "", " ".join(texts.get(name, "").split()))
+
+
 def build_configuration_reference() -> str:
     """Return Markdown with one section per TOML table and one line per key."""
     parts = [CONFIGURATION_HEAD]
     for path, model in sections(Config):
         schema, texts = model.model_json_schema()["properties"], read_field_docstrings(model)
         rows = [
-            f"- `{name}` ({format_type(schema[name])}; {format_default(info)}): {' '.join(texts.get(name, '').split())}"
+            f"- `{name}` ({format_type(schema[name])}; {format_default(info)}): {describe(name, texts)}"
             for name, info in model.model_fields.items()
             if not is_table(info)
         ]
