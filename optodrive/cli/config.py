@@ -43,6 +43,10 @@ def new(
     port: Annotated[
         str | None, typer.Option("--port", metavar="DEVICE", help="Serial device of the board, or: simulated.")
     ] = None,
+    kpps: Annotated[
+        float | None,
+        typer.Option("--kpps", metavar="N", min=1.0, max=100.0, help="Rating of the galvos at 8 degrees, in kpps."),
+    ] = None,
 ) -> None:
     """Write a configuration. Ask on the terminal for each value that no option states."""
     from optodrive.core.files import check_output, write_text
@@ -60,7 +64,7 @@ def new(
     question = "Focal length of the f-theta lens, mm"
     lens_mm = _ask("--lens-mm", lens_mm, question, 220.0, lambda option, mm: check_lens(option, mm, farthest_m))
     port = _ask("--port", port, "Serial device of the board, or: simulated", "simulated", check_port)
-    display = NewDisplay(file.stem, rows, columns, 1e-3 * pitch_mm, power_w, 1e-3 * lens_mm, port)
+    display = NewDisplay(file.stem, rows, columns, 1e-3 * pitch_mm, power_w, 1e-3 * lens_mm, port, kpps)
     text, config = write_template(display, file)
     DisplayModel.from_config(config)
     write_text(file, text)

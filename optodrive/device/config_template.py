@@ -18,6 +18,10 @@ FULL_SIZE_PITCH_M = 3.5e-3
 Below it both shrink with the pitch. Across an edge of the absorber, a sweep of the pixels moves the focus by up to
 1.7 mm from the middle, its half width included, and may not leave the pixel's cell.
 """
+POINTS_PER_CIRCLE = 12
+"""Points of the circle in ILDA's test pattern, which falls by about 3 dB at the rate for which galvos are rated."""
+RATED_HALF_WIDTH = 0.3
+"""Half-width of what a rating says of a servo: circles of dampings of 0.5 to 0.87 fall alike."""
 HEAD_LINES = 2
 """Lines of the template that describe its display."""
 
@@ -26,7 +30,8 @@ HEAD_LINES = 2
 class NewDisplay:
     """Values that tell a new display from the template, in SI units.
 
-    port: a serial device, or `simulated`
+    port: a serial device, or `simulated`; kpps: rating of the galvos at 8°, thousands of points per second, None if
+    the template's servo stays
     """
 
     name: str
@@ -36,6 +41,7 @@ class NewDisplay:
     power_w: float
     focal_length_m: float
     port: str
+    kpps: float | None = None
 
 
 def write_template(display: NewDisplay, path: Path) -> tuple[str, Config]:
@@ -59,8 +65,18 @@ def write_template(display: NewDisplay, path: Path) -> tuple[str, Config]:
         written.append(values.pop((section, key), line))
         if (section, key) == ("board", "transport") and display.port != SIMULATED:
             written.append(f"port = {json.dumps(display.port)}")
+        if (section, key) == ("scanner", "slew_rad_per_s") and display.kpps is not None:
+            written += _list_half_widths(config)
     text = "\n".join(written) + "\n"
     return text, build_config(path, parse_toml(text.encode(), str(path)))
+
+
+def _list_half_widths(template: Config) -> list[str]:
+    """Return the lines of the servo's half-widths for galvos of which only a rating is known."""
+    keys = ("bandwidth_uncertainty", "damping_uncertainty", "slew_uncertainty")
+    note = "# a rating says no more; see calibrate servo"
+    lines = [f"{key} = {RATED_HALF_WIDTH:g}".ljust(34) + note for key in keys]
+    return [*lines, f"delay_uncertainty_s = {template.scanner.delay_s:g}".ljust(34) + "# it says nothing of the delay"]
 
 
 def check_number(option: str, value: float, key: str, unit: str) -> None:
@@ -119,6 +135,9 @@ def _list_values(display: NewDisplay, template: Config) -> dict[tuple[str, str],
         "limits.pixel_mean_power_max_w": (pixel_w, "continuous power on one pixel"),
         "limits.display_mean_power_max_w": (power_w, "continuous power of the diode; lower it for a diode that droops"),
     }
+    if display.kpps is not None:
+        rated_hz = 1e3 * display.kpps / POINTS_PER_CIRCLE
+        numbers["scanner.bandwidth_hz"] = (rated_hz, f"of galvos rated {display.kpps:g} kpps at 8 deg")
     texts = {".name": display.name, "board.transport": "simulated" if display.port == SIMULATED else "serial"}
     lines = {place: (json.dumps(value), "") for place, value in texts.items()}
     lines |= {place: (f"{value:.6g}", comment) for place, (value, comment) in numbers.items()}

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from optodrive.cli.main import run
@@ -32,6 +33,23 @@ def test_the_file_is_that_of_the_display(tmp_path, capsys):
     assert run(["config", "check", "--config", str(path)]) == 0
     named = [line for line in path.read_text().splitlines() if "=" in line]
     assert sum("#" in line for line in named) > len(named) / 2, "most keys have a comment"
+
+
+@pytest.mark.parametrize("kpps", [8, 20, 40])
+def test_a_rating_covers_every_servo_that_earns_it(kpps, tmp_path):
+    """At the rate of its points the circle of ILDA's test pattern falls by 3 dB, with any damping."""
+    path = tmp_path / "mine.toml"
+    assert write(path, kpps=kpps) == 0
+    scanner = load_config(path).scanner
+    low_hz, high_hz = (scanner.bandwidth_hz * (1 + sign * scanner.bandwidth_uncertainty) for sign in (-1, 1))
+    low, high = (scanner.damping * (1 + sign * scanner.damping_uncertainty) for sign in (-1, 1))
+    rated_hz, hz = kpps * 1000 / 12, np.arange(0.5, 2.0, 1e-3) * kpps * 1000 / 12
+    for damping in np.linspace(0.5, 0.87, 12):
+        gain = np.abs(1.0 / (1.0 - (rated_hz / hz) ** 2 + 2j * damping * rated_hz / hz))
+        servo_hz = hz[np.argmin(np.abs(gain - 0.5**0.5))]
+        assert low_hz <= servo_hz <= high_hz
+        assert low <= damping <= high
+    assert scanner.delay_s - scanner.delay_uncertainty_s == 0.0
 
 
 def test_without_changes_it_is_the_template(tmp_path):
