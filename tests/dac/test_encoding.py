@@ -8,15 +8,18 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from dac.bench import build_display, build_frame, build_train, build_verified, raw_points
+from dac.bench import build_config, build_display, build_frame, build_train, build_verified, raw_points
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.plans import EMPTY_PLAN
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.device.config import Config
 from optodrive.link.dac.encoding import PointScale, decode, encode
 from optodrive.link.dac.formats.base import CHUNK_MAX_S
 from optodrive.link.dac.formats.helios import HeliosFormat
 from optodrive.link.dac.player import verify_chunks
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import limit
+from optodrive.planning.pipeline import plan_sequence
 
 
 @pytest.mark.parametrize(("requested", "actual"), [(20_000, 19_996.43), (40_000, 39_985.72), (50_000, 49_977.69)])
@@ -282,3 +285,27 @@ def test_a_wrong_rate_fails_verification():
     frames = [frame.data[:-5] + struct.pack("<H", 50_000) + frame.data[-3:] for frame in verified.chunks]
     with pytest.raises(LocalProtocolError, match="exceeds the plan's pulses"):
         verify_chunks(frames, plan, scale, budget, display.budget)
+
+
+@pytest.mark.parametrize("transport", ["helios", "ether_dream", "idn"])
+def test_levels_follow_the_curve_of_the_laser_and_reach_its_threshold(transport):
+    """The light of each level by the laser's table is that of the plan, or less by at most a level."""
+    rows = [[0.0, 0.0], [0.1, 0.0], [0.2, 0.3], [0.5, 0.8], [1.0, 2.45]]
+    table = build_config(transport=transport, port="dac" if transport != "helios" else "").model_dump()
+    table["laser"] |= {"curve": rows, "threshold_w": 0.3}
+    display = DisplayModel.from_config(Config.model_validate(table))
+    scale = PointScale.from_config(display.config)
+    powers_w = np.geomspace(display.config.min_power_w, 2.45, 9)
+    trains = tuple(PulseTrain(k, 0.1 * k, 0.01, 0.01, 0.01, float(power_w)) for k, power_w in enumerate(powers_w))
+    plan = plan_sequence(display, FrameSequence(trains=trains), *display.build_cold_state()).plan
+    tables = [scale.format.parse(chunk.data)[0] for chunk in encode(plan, scale)]
+    levels = np.concatenate(tables)[:, 2] / scale.format.level_max
+    emitted_w = np.interp(levels, *np.transpose(rows)) * scale.format.stretch
+    found_w = emitted_w[levels > 0]
+    found_w = found_w[np.append(True, np.diff(found_w) != 0)]
+    step_w = 3.3 / scale.format.level_max * scale.format.stretch
+    planned_w = plan.power_w[plan.power_w > 0]
+    assert len(found_w) == len(planned_w) == 9
+    assert (found_w <= planned_w * (1 + 1e-9)).all()
+    assert (found_w > planned_w - step_w).all()
+    assert found_w.min() >= 0.3 * scale.format.stretch * (1 - 1e-9)

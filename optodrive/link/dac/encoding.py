@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError
+from optodrive.core.laser_power import ROUNDING, compute_duty
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.device.config import Config
@@ -105,7 +106,9 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     share = plan.power_w / scale.full_power_w
     if len(plan) and not 0 <= share.min() <= share.max() <= 1 + 1e-12:
         raise LocalProtocolError(f"powers of {share.min():g} to {share.max():g} leave the range 0 to 1 of the laser's")
-    duty = np.where(scale.to_duty(plan.power_w) > 0.0, scale.to_duty(plan.power_w / scale.format.stretch), 0.0)
+    # A device that may play slower emits less power for longer: a pulse's power has the stretch, its light has not.
+    duty = compute_duty(plan.power_w / scale.format.stretch, scale.full_power_w, scale.curve)
+    duty[plan.power_w < scale.min_power_w * (1.0 - ROUNDING)] = 0.0
     level = np.floor(duty * level_max * (1 + 1e-12)).astype(np.int64)
     first, last = -(-start // ticks) + scale.format.settling_points, end // ticks
     last[:-1] -= last[:-1] == first[1:]  # a blank point separates adjacent pulses

@@ -331,6 +331,17 @@ def test_a_pulse_trimmed_within_a_period_of_the_pwm_keeps_the_cap(width_us, shar
     assert energy_j >= 0.99 * cap_j
 
 
+@pytest.mark.parametrize("width_s", [0.3e-3, 1.1e-3, 1.19e-3, 2.05e-3])
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.99])
+def test_of_a_laser_with_a_curve_a_part_of_a_period_counts_as_a_whole_one(width_s, share):
+    """When in a period it emits is not known."""
+    energy_j = share * 2.45 * width_s
+    budget = build_budget(pulse_energy_j=energy_j)._replace(is_proportional=np.array([False]))
+    plan, _ = limit(pulses((0, 0.01, width_s, 2.45)), build_cold_budget_state(3), budget)
+    periods = np.ceil(width_s / 2e-4 - 1e-9)
+    assert plan.power_w[0] * periods * 2e-4 == pytest.approx(energy_j, rel=1e-6)
+
+
 def test_a_limiter_without_regard_to_split_periods_is_caught(monkeypatch):
     """Mutant: the mean power counts for any width."""
     monkeypatch.setattr(limiter, "_allow_for_split_period", lambda plan, power_w, budget: power_w)
