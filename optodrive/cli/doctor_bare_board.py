@@ -89,6 +89,8 @@ def _examine(conversation: _Conversation) -> list[Finding]:
     peer = conversation.greet()
     status = conversation.get_status()
     findings = [_check_identity(peer, status), *_report_capacities(peer), check_inputs(status.inputs)]
+    if peer.capabilities & m.CAPABILITY_XY2_100:
+        findings.append(_check_head(status.head))
     findings += _check_clock(conversation, peer.tick_hz)
     if peer.minor >= TRIGGER_MINOR:
         findings.append(_report_triggers(conversation.ask(m.GetTriggers(), m.Triggers), status))
@@ -117,6 +119,17 @@ def _report_capacities(peer: m.HelloReply) -> list[Finding]:
         report_ok("capacities", f"{tables} of {peer.cell_codes} codes"),
         report_ok("limits", f"{pulse}, {spot}, lease {limits.lease_ms} ms"),
     ]
+
+
+def _check_head(status: int) -> Finding:
+    """Return the finding on a digital scan head. status: its last one, 0 for none."""
+    if not status:
+        return report_problem("scan head", "no valid status", "check plug, supply and wires of STATUS")
+    lacking = [name for bit, name in m.HEAD_BITS.items() if not status & bit]
+    if lacking:
+        remedy = "see its manual; some need a while after power-up"
+        return report_problem("scan head", f"{' and '.join(lacking)} not in order, status {status:#06x}", remedy)
+    return report_ok("scan head", f"ready, status {status:#06x}")
 
 
 def _report_triggers(triggers: m.Triggers, at_begin: m.Status) -> Finding:

@@ -41,6 +41,8 @@ NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
 EVENT_REASONS = tuple(EventReason)
 INPUTS = ("interlock", "key", "estop")
 CAPABILITY_KEY_EDGE, CAPABILITY_XY2_100 = 1, 2
+HEAD_BITS = {0x8000: "power", 0x4000: "temperature"}
+"""Bits of a ready scan head's status, and what is in order then."""
 
 POINT = struct.Struct("<HHHHH")
 """x, y (DAC codes), dark_us (gate off before the pulse), on_us (gate on), duty (1/65535)."""

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from c_core import CBoard, build_library
 from forked_process import SIMULATED, start_process
 from optodrive.cli.doctor_bare_board import check_bare_board
 from optodrive.cli.main import run
@@ -75,6 +76,29 @@ def test_inputs_and_a_fault_are_named():
     assert findings["inputs"].observation == "the enclosure is open; the emergency stop is pressed"
     assert findings["board"].status == "warning"
     assert "FAULT INTERLOCK" in findings["board"].observation
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory):
+    return build_library(tmp_path_factory.mktemp("core"))
+
+
+@pytest.mark.parametrize(
+    ("status", "observation"),
+    [
+        (0xFDFD, "ready, status 0xfdfd"),
+        (0x7D7D, "power not in order, status 0x7d7d"),
+        (0x3D3D, "power and temperature not in order, status 0x3d3d"),
+        (0, "no valid status"),
+    ],
+)
+def test_a_digital_scan_head_is_described(library, status, observation):
+    board = CBoard(library, BoardSettings(interface="xy2-100"))
+    board.set_head(status)
+    clock = ManualClock(5.0)
+    findings = {each.check: each for each in check_bare_board(MemoryLink(board, clock), clock)}
+    assert findings["scan head"].observation == observation
+    assert (findings["scan head"].status == "ok") == observation.startswith("ready")
 
 
 class PulsedLink(MemoryLink):
