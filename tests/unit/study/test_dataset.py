@@ -152,8 +152,8 @@ def test_an_identifier_in_other_letters_is_refused(tmp_path):
 
 
 def test_the_study_of_the_documentation_can_be_rehearsed(tmp_path, capsys):
-    page = (Path(__file__).parents[3] / "docs/how-to/run-a-study.md").read_text()
-    (study,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    page = (Path(__file__).parents[3] / "docs/how-to/design-a-study.md").read_text()
+    study, _ = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "study.toml").write_text(study)
     assert run(["study", str(tmp_path / "study.toml"), "--out", str(tmp_path / "data"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["trials"] == 40

@@ -30,6 +30,11 @@ TABLE = {
     "pause_s": 0.0,
     "response": {"kind": "choice", "question": "Which?", "answers": ["x", "y"]},
 }
+EMPTY = {
+    "stimulus": {"pattern": "vibration", "parameters": {"seconds": 0.5, "height_um": 90.0}, "gap_s": 0.4},
+    "intervals": [{"name": "vibration"}, {"name": "empty", "nothing": True}],
+    "factors": {"rate_hz": [25.0]},
+}
 
 
 def build_study(**changes):
@@ -56,8 +61,7 @@ def test_intervals_follow_each_other_on_one_time_line():
 
 
 def test_an_empty_interval_lasts_as_long_as_the_stimulus():
-    study = load_study("height-threshold")
-    condition = {"rate_hz": 25.0, "height_um": 90.0}
+    study, condition = build_study(**EMPTY), {"rate_hz": 25.0}
     for order, start_s in ((("empty", "vibration"), 0.9), (("vibration", "empty"), 0.0)):
         stimulus = build(study, build_trial(condition, order))
         (train,) = stimulus.sequence.trains
@@ -74,8 +78,7 @@ def presenter():
 
 @pytest.mark.parametrize(("order", "lead_s"), [(("empty", "vibration"), 0.9), (("vibration", "empty"), 0.0)])
 def test_an_empty_interval_takes_its_time_on_the_board(presenter, order, lead_s):
-    study = load_study("height-threshold")
-    stimulus = build(study, build_trial({"rate_hz": 25.0, "height_um": 90.0}, order))
+    stimulus = build(build_study(**EMPTY), build_trial({"rate_hz": 25.0}, order))
     before_s = presenter._boards.now_s
     shown = presenter.present(stimulus)
     assert shown.onset_s - before_s == pytest.approx(lead_s + 0.05, abs=0.03)
