@@ -158,6 +158,8 @@ def format_model(name, schema, configured, is_inner):
         r"\bNone\b", "null", schema.get("description", "")
     )  # as JSON says what Python's docstrings say
     summary, meanings = read_meanings(description, members)
+    if is_inner:  # its first sentence
+        summary = re.split(r"(?<=\.)\s", summary, maxsplit=1)[0]
     if summary:
         lines += [summary, ""]
     if "properties" not in schema:

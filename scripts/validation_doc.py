@@ -88,21 +88,11 @@ pages.
 JSON_KEYS = """\
 ## `optodrive validate --diagnose --json`
 
-One object, SI units, temperatures as rises in K:
-
-- `parameter_set`, `verdict`, `sets` (the causes named), `reasons`, as of a diagnosis
-- `probabilities`: `no_effect`, `none_of_these`, `causes` (each set above 1 %: `causes`, `probability`)
-- `facts`: each `id`, `group`, `value`, `relative_error` (from `reading_error`, of a `source`, and `scatter`),
-  `nominal_ratio`, `extended_ratio`, `error_sigma`
-- `excluded`: outcome → reason; `unexplained`: facts that deviate by more than two standard errors
-- `chi2`, `factor`: `nominal`, `extended`; of χ² also `degrees_of_freedom`; `aicc_per_cause`, `aicc_indistinguishable`
-- `causes`: each `cause`, `description`, `parameter`, `value`, `low`, `high` (95 %), `unit`, `chi2_reduction`,
-  `evidence`, `alternatives`, `deciding_measurement`
-- `candidates`, the other causes: also `probability`, `chi2_reduction_alone`, `chi2_reduction_added`, `replaces`,
-  `replaced_fraction`, `is_observable`, `is_alternative_law`
-- `contradictions`: each `assumption`, `description`, `ratio`
-- `gain`: `groups` and `facts`, each `held_out`, `facts`, `causes`, `unobservable`, `nominal`, `extended` (ratios model
-  over measured), `changes` of χ² (`signal`, `chi2`, `noise`); `factor_groups`, `factor_each`: `nominal`, `extended`
+One object, SI units, temperatures as rises in K, with the members that the text has: `parameter_set`, `verdict`, `sets`
+(the causes named), `reasons`, `probabilities`, `facts` (each with the ratios of both models and `error_sigma`),
+`excluded`, `unexplained` (facts that deviate by more than two standard errors), `chi2`, `factor`, `aicc_per_cause`,
+`aicc_indistinguishable`, `causes` (each with value, 95 % interval, `evidence`, `alternatives`, `deciding_measurement`),
+`candidates` (all other causes), `contradictions`, and `gain` by held-out group and fact.
 """
 
 

@@ -28,7 +28,7 @@ Invariants. Bounds are never below the truth and never lowered but by cooling at
 `exchanged_at_s` and `nodes_at_s` never go back. Pulses of another stage may overlap: a pixel's own time then lies ahead
 (`_wall_since_k`).
 
-Decisions: 41 (stages), 45 (panel, and what a finger touches).
+Decision: 41 (stages).
 """
 
 from math import exp, inf, log

@@ -29,8 +29,7 @@ credit never costs power. The result never exceeds the requested power. A power 
 before the pulse was within the set, unless the panel has taken the cap away.
 
 Rejected: one run per corner of the parameter box, as the worst case need not be a corner, and a wall whose capacity may
-change at any moment, with which a train ratchets up by the ratio of both capacities. Decision 45 says how the panel
-enters.
+change at any moment, with which a train ratchets up by the ratio of both capacities.
 """
 
 from math import exp, inf, log

@@ -24,7 +24,7 @@ a bound, and are therefore taken at the other end, with deficits for what neighb
 
 Invariant. Every field of `Uncertainty` and of `HeatBound` enters here or, for the panel, in `panel_bound.py`; a test
 walks over all declared uncertainties and requires each to be counted. Judged by an integrator that shares no code with
-the limiter (`tests/reference_models`). Decisions: 41 (skew of stages), 45.
+the limiter (`tests/reference_models`). Decision: 41 (skew of stages).
 """
 
 from dataclasses import dataclass
