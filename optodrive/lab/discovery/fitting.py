@@ -11,7 +11,7 @@ from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.lab.discovery.forms import THRESHOLDS
 from optodrive.lab.discovery.integration import FORM, MEMORY, STEP, VARIABLE, Kernels, allocate_work, build_kernels
 from optodrive.lab.discovery.linearisation import Linearisation
-from optodrive.lab.discovery.memory import NONE, PATH
+from optodrive.lab.discovery.memory import NONE, OSCILLATION, PATH
 from optodrive.lab.discovery.model import OdeModel, Record
 from optodrive.lab.inference.fit import fit_residuals
 
@@ -65,8 +65,9 @@ class Terms:
 
     @property
     def memories(self) -> IntArray:
-        """Rows with memory [k], in the order in which their inner states follow the model's."""
-        return np.flatnonzero(self.table[:, MEMORY] != NONE)
+        """Row of each inner state [k] that follows the model's."""
+        kinds = self.table[:, MEMORY]
+        return np.repeat(np.arange(len(kinds)), 1 * (kinds != NONE) + (kinds == OSCILLATION))
 
     def __getitem__(self, rows: slice) -> "Terms":
         return Terms(*(getattr(self, f)[rows] for f in Terms.__dataclass_fields__))

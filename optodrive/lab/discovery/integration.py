@@ -29,13 +29,14 @@ from optodrive.core.kernels import compile_here
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.forms import evaluate_form
 from optodrive.lab.discovery.linearisation import copy, correct, predict_covariance
-from optodrive.lab.discovery.memory import DELAY, NONE, carry, start_memory, take_value
+from optodrive.lab.discovery.memory import DELAY, NONE, OSCILLATION, carry, oscillate, start_memory, take_value
 
 PLACE, FORM, VARIABLE, FACTOR, MEMORY = range(5)
 """Columns of a table of terms: place (states' equations, then outputs), form, variable, a variable that multiplies the
 form, or -1, and which memory of the variable the form is a function of. Variables: states, inputs, time, quantities of
-the model. The table of values holds amplitude, the form's inner numbers and the memory's scale."""
-SCALE = 3
+the model. The table of values holds amplitude, the form's inner numbers and the memory's scale; an oscillation's
+damping takes the place of the second inner number, and its rate follows it in the vector of states."""
+DAMPING, SCALE = 2, 3
 STEP = 1e-5
 """Relative step of derivatives."""
 MAX_STATE = 1e9
@@ -171,7 +172,7 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         for row in range(len(terms)):
             if terms[row, MEMORY] != NONE:
                 out[slot] = variable(terms[row, VARIABLE], t, x, u, derived)
-                slot += 1
+                slot += 2 if terms[row, MEMORY] == OSCILLATION else 1
 
     @compile_
     def remember(
@@ -195,6 +196,10 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
                 z = variable(terms[row, VARIABLE], t, out, u, derived)
                 if kind == DELAY:
                     out[slot] = delayed(terms[row, VARIABLE], k, t, z, values[row, SCALE], fixed, states)
+                elif kind == OSCILLATION:
+                    scale, damping = values[row, SCALE], values[row, DAMPING]
+                    out[slot], out[slot + 1] = oscillate(x[slot], x[slot + 1], z0[slot], z, dt, scale, damping)
+                    slot += 1
                 else:
                     out[slot] = carry(kind, x[slot], z0[slot], z, dt, values[row, SCALE])
                 slot += 1
@@ -209,7 +214,7 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
             z = variable(terms[row, VARIABLE], t, x, u, derived)
             if terms[row, MEMORY] != NONE:
                 z = take_value(terms[row, MEMORY], x[slot], z)
-                slot += 1
+                slot += 2 if terms[row, MEMORY] == OSCILLATION else 1
             if first <= terms[row, PLACE] < last:
                 factor = 1.0 if terms[row, FACTOR] < 0 else variable(terms[row, FACTOR], t, x, u, derived)
                 form = evaluate_form(terms[row, FORM], z, values[row, 1], values[row, 2])
@@ -251,6 +256,9 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         for row in range(len(terms)):
             if terms[row, MEMORY] != NONE:
                 x[slot] = start_memory(terms[row, MEMORY], x[slot])
+                if terms[row, MEMORY] == OSCILLATION:
+                    slot += 1
+                    x[slot] = 0.0
                 slot += 1
 
     @compile_

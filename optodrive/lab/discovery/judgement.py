@@ -151,7 +151,8 @@ class Judge(FreeRuns):
         # formula of physics that gains nearly as much.
         physical = max((g for form, g in zip(forms, minimum, strict=True) if form.kind not in NAMELESS), default=0.0)
         prior = [
-            PER_NUMBER**each.candidate.numbers
+            PER_NUMBER
+            ** (each.candidate.numbers + self.simulation.model.is_follower(each.candidate.screened.at.variable))
             * (PER_CHANGE if form.kind == CHANGE else 1.0)
             * (max(minimum) <= 0.0 or gain >= MIN_KEPT * max(minimum))
             * (form.kind != CURVE or physical < NEARLY * gain)
@@ -208,7 +209,9 @@ class Judge(FreeRuns):
     def _find_twin(self, filtered: Sequence[Filtered], proposal: Proposal) -> str:
         """Return another variable, or a memory elsewhere, that would predict the same, "" if there is none."""
         model, at = self.simulation.model, proposal.candidate.screened.at
-        if at.memory in FILTERS:  # with other parameters, one at another place predicts nearly the same
+        if at.memory in FILTERS or (
+            model.is_follower(at.variable) and proposal.candidate.form.kind == LINEAR.kind
+        ):  # with other parameters, one at another place predicts nearly the same
             return "a linear memory at another place"
         if model.from_rest:
             return ""
@@ -261,7 +264,9 @@ def name_form(simulation: Simulation, candidate: Candidate, values: FloatArray) 
     formula = NAMELESS[CHANGE] if kind == CHANGE else form.describe(values, *involved)
     if at.memory != NONE:
         kind = name_memory(at.memory, at.place >= len(model.states), at.variable < len(model.states))
-        formula = f"{values[0]:.4g} {TEXTS[at.memory].format(z=involved[0], s=f'{values[3]:.4g}')}"
+        formula = (
+            f"{values[0]:.4g} {TEXTS[at.memory].format(z=involved[0], s=f'{values[3]:.4g}', d=f'{values[2]:.4g}')}"
+        )
     return TermForm(model.place_names[at.place], involved, kind, NAMELESS.get(kind, formula), 0.0, 0.0)
 
 

@@ -46,8 +46,10 @@ class OdeModel:
     its first measured outputs, [up to 100 samples, outputs] (of one sample, [outputs], if the function needs it so),
     and the parameters, of which some may occur only there. quantities: names of what `quantity` returns from the same
     arguments as `rhs`, further variables of a term; places: where a term may enter, what it depends on and what
-    multiplies it ("" for nothing), everywhere by default; from_rest: records begin in a known state, and inputs are
-    constant from one sample to the next, as in pulses, so that no filter is needed to keep the states near the data
+    multiplies it ("" for nothing), everywhere by default; memories: beside such places, where a term may enter, whose
+    past it depends on, and which kinds of memory; followers: states that follow others with a time constant of their
+    own, as a memory does; from_rest: records begin in a known state, and inputs are constant from one sample to the
+    next, as in pulses, so that no filter is needed to keep the states near the data
     """
 
     states: tuple[str, ...]
@@ -60,6 +62,8 @@ class OdeModel:
     quantities: tuple[str, ...] = ()
     quantity: Callable[[Any, Any, Any, Any], Sequence[Any]] = no_quantity
     places: tuple[tuple[str, str, str], ...] = ()
+    memories: tuple[tuple[str, str, tuple[int, ...]], ...] = ()
+    followers: tuple[str, ...] = ()
     from_rest: bool = False
 
     def __post_init__(self) -> None:
@@ -79,6 +83,10 @@ class OdeModel:
     def variable_names(self) -> tuple[str, ...]:
         """Quantities that a term can depend on: states, inputs, time, and those of the model."""
         return (*self.states, *self.inputs, "t", *self.quantities)
+
+    def is_follower(self, variable: int) -> bool:
+        """Return whether a variable is a state that follows another one."""
+        return self.variable_names[variable] in self.followers
 
     @property
     def place_names(self) -> tuple[str, ...]:

@@ -19,7 +19,17 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.discovery.fitting import Point, Simulation, Terms, weigh
 from optodrive.lab.discovery.forms import CONSTANT, CURVE, LINEAR, Form, list_forms
 from optodrive.lab.discovery.linearisation import Linearisation
-from optodrive.lab.discovery.memory import DELAY, LAG, NONE, PATH, remember
+from optodrive.lab.discovery.memory import (
+    DELAY,
+    LAG,
+    MAX_DAMPING,
+    MIN_DAMPING,
+    NONE,
+    OSCILLATION,
+    PATH,
+    START_DAMPING,
+    remember,
+)
 from optodrive.lab.discovery.model import Curve, Record
 
 EVEN_NODES = 21
@@ -37,9 +47,9 @@ TWIN_SHARE = 0.02
 SLOW_NODES = 6
 Evaluate = Callable[[FloatArray], FloatArray]
 MEMORY_NODES = 5
-MIN_WAY, MAX_WAY, MAX_TIME, SCALE_RATIO = 0.003, 0.5, 0.2, 2.5
+MIN_WAY, MAX_WAY, MAX_TIME, SCALE_RATIO, PERIOD_RATIO = 0.003, 0.5, 0.2, 2.5, 1.2
 """Distances of presliding relative to a variable's range, longest time constant relative to a record, and the ratio
-from one scale of a memory to the next."""
+from one scale of a memory, and of an oscillation, to the next."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +140,8 @@ class Candidate:
     @property
     def numbers(self) -> int:
         """How many numbers the formula has, and one for a factor."""
-        return 1 + self.form.free + (self.screened.at.factor >= 0) + (self.screened.at.memory != NONE)
+        memory = self.screened.at.memory
+        return 1 + self.form.free + (self.screened.at.factor >= 0) + (memory != NONE) + (memory == OSCILLATION)
 
     @property
     def is_constant(self) -> bool:
@@ -141,12 +152,15 @@ class Candidate:
         """Return the candidate as a row of a table of terms, with limits of its numbers."""
         at, form, nodes = self.screened.at, self.form, self.screened.nodes
         span, (low, high) = float(nodes[-1] - nodes[0]), form.limit(nodes, self.first)
+        second = (self.second, 0.01 * span, 10.0 * span)
+        if at.memory == OSCILLATION:
+            second = (START_DAMPING, MIN_DAMPING, MAX_DAMPING)
         return Terms(
             np.array([[at.place, form.code, at.variable, at.factor, at.memory]]),
-            np.array([[self.amplitude, self.first, self.second, at.scale]]),
-            np.array([[True, form.free > 0, form.free > 1, at.memory != NONE]]),
-            np.array([[-np.inf, low, 0.01 * span, at.shortest]]),
-            np.array([[np.inf, high, 10.0 * span, 20.0 * at.scale + 1e-300]]),
+            np.array([[self.amplitude, self.first, second[0], at.scale]]),
+            np.array([[True, form.free > 0, form.free > 1 or at.memory == OSCILLATION, at.memory != NONE]]),
+            np.array([[-np.inf, low, second[1], at.shortest]]),
+            np.array([[np.inf, high, second[2], 20.0 * at.scale + 1e-300]]),
         )
 
 
@@ -178,26 +192,34 @@ def list_places(simulation: Simulation, filtered: Sequence[Filtered], point: Poi
 def list_memories(simulation: Simulation, filtered: Sequence[Filtered], places: Sequence[Place]) -> list[Place]:
     """Return the places with a memory of each state and input, of some time constants and distances.
 
-    A model that names its places names its memories too, as states.
+    A model that names its places names its memories too.
     """
     model = simulation.model
-    if model.places:
-        return []
     times = [each.record.t_s for each in filtered]
     step_s, long_s = float(np.median(np.diff(times[0]))), max(float(t[-1] - t[0]) for t in times)
+    spots, kinds = list(dict.fromkeys(at.place for at in places)), range(LAG, DELAY + 1)
+    names = [
+        (model.place_names.index(where), model.variable_names.index(on), kind)
+        for where, on, own in model.memories
+        for kind in own
+    ]
+    if not model.places:
+        names = [*product(spots, range(len(model.states) + len(model.inputs)), kinds)]
     found = []
-    for variable in range(len(model.states) + len(model.inputs)):
+    for spot, variable, kind in names:
         span = float(np.ptp(np.concatenate([each.variables[:, variable] for each in filtered])))
         if not np.isfinite(span) or span <= 0.0:
             continue
-        for kind in range(LAG, DELAY + 1):
-            low, high = (MIN_WAY * span, MAX_WAY * span) if kind in PATH else (2.0 * step_s, MAX_TIME * long_s)
-            count = 1 + ceil(np.log(high / low) / np.log(SCALE_RATIO))
-            # Over a shorter distance presliding is dry friction, which is a function of the present.
-            shortest = low if kind in PATH else 0.25 * low
-            found += [(variable, -1, kind, float(scale), shortest) for scale in np.geomspace(low, high, count)]
-    spots = list(dict.fromkeys(at.place for at in places))
-    return [Place(spot, *each) for spot in spots for each in found]
+        low, high, ratio = 2.0 * step_s, MAX_TIME * long_s, SCALE_RATIO
+        if kind in PATH:
+            low, high = MIN_WAY * span, MAX_WAY * span
+        elif kind == OSCILLATION:  # whose phase a wrong period loses soon
+            low, high, ratio = 0.25 * step_s, 10.0 * step_s, PERIOD_RATIO
+        count = 1 + ceil(np.log(high / low) / np.log(ratio))
+        # Over a shorter distance presliding is dry friction, which is a function of the present.
+        shortest = low if kind in PATH else 0.25 * low
+        found += [Place(spot, variable, -1, kind, float(scale), shortest) for scale in np.geomspace(low, high, count)]
+    return found
 
 
 def screen_memories(filtered: Sequence[Filtered], places: Sequence[Place], n: int) -> list[Place]:
@@ -384,7 +406,7 @@ def find_twin(filtered: Sequence[Filtered], at: Place, evaluate: Evaluate, names
             continue
         nodes = np.linspace(variable.min(), variable.max(), SLOW_NODES) if number == time else choose_nodes(variable)
         hats = hat_functions(variable, nodes)
-        rest = values - hats @ np.linalg.lstsq(hats, values, rcond=None)[0]
+        rest = values - hats @ np.linalg.lstsq(hats.T @ hats, hats.T @ values, rcond=None)[0]
         if float(rest @ rest) < TWIN_SHARE * spread:
             return f"a function of {name}"
     return ""

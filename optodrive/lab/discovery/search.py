@@ -15,7 +15,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.discovery.fitting import Point, Simulation, Terms, fit
 from optodrive.lab.discovery.forms import CURVE, CURVES
-from optodrive.lab.discovery.held_out import UNCOMPUTABLE, Proposal
+from optodrive.lab.discovery.held_out import MEMORY_FIT, UNCOMPUTABLE, Proposal
 from optodrive.lab.discovery.judgement import is_same
 from optodrive.lab.discovery.memory import NONE
 from optodrive.lab.discovery.model import Record
@@ -136,8 +136,11 @@ class TermSearch:
         for screening, start in zip(screenings, starts, strict=True):
             is_first = screening is screenings[0]
             places = self._choose_places(screening, point.terms, is_first)
-            proposals, evaluations = list[Proposal](), 3 if self.model.from_rest else 5
+            proposals = list[Proposal]()
             for screened in places:
+                evaluations = 3 if self.model.from_rest else 5
+                if self.model.from_rest and screened.at.memory != NONE:
+                    evaluations = MEMORY_FIT  # its first steps find the scale, and gain little
                 proposals += self._propose(screened, start, point.terms, screening.filtered, evaluations)
             if self.model.from_rest:
                 for _ in range(REFINEMENTS if proposals else 0):
@@ -177,7 +180,8 @@ class TermSearch:
         chosen, counts, physical = list[Proposal](), dict[tuple[object, ...], int](), 0
         for each in sorted(proposals, key=lambda p: p.loss):
             at, is_curve = each.candidate.screened.at, each.candidate.form.kind == CURVE
-            is_change, has_memory = self._is_change(each.candidate.screened), at.memory != NONE
+            is_change = self._is_change(each.candidate.screened)
+            has_memory = at.memory != NONE or self.model.is_follower(at.variable)
             key: tuple[object, ...] = (at.key, is_curve and not is_change)
             room = 2 if is_change else 1 if is_curve else per_place
             if each.candidate.is_constant:

@@ -77,8 +77,15 @@ def fit_residuals(
             return residual
         return np.append(residual, (whole - prior.mean)[stated] / prior.sigma[stated])
 
+    last = [fixed[rows], compute(fixed[rows])]  # derivatives begin at the point whose residuals were computed last
+
+    def recall(part: FloatArray) -> FloatArray:
+        if not np.array_equal(part, last[0]):
+            last[:] = part.copy(), compute(part)
+        return last[1]
+
     def differentiate(part: FloatArray) -> FloatArray:
-        at, columns = compute(part), np.empty((size, len(rows)))
+        at, columns = recall(part), np.empty((size, len(rows)))
         for column, row in enumerate(rows):
             shifted = part.copy()
             # A difference looks inside the bounds, where the model is defined.
@@ -87,12 +94,12 @@ def fit_residuals(
         return columns
 
     covariance = np.zeros((len(start), len(start)))
-    first = compute(fixed[rows])
+    first = last[1]
     size = len(first)
     if not len(rows):
         return Fit(fixed, first, float(first @ first), covariance)
     found = least_squares(
-        compute,
+        recall,
         fixed[rows],
         jac=differentiate,
         bounds=(low[rows], high[rows]),

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from optodrive.lab.discovery import OdeModel, Parameter
+from optodrive.lab.discovery.memory import DAHL, DELAY, FOLLOWER, LAG, OSCILLATION, SLIP
 
 TEMPERATURE, DISPLACEMENT, FORCE = OUTPUTS = ("temperature", "displacement", "force")
 """Outputs in the order of the signals' kinds: rise of the absorber, K; m; N."""
@@ -37,6 +38,9 @@ OUTPUT_PLACES = {
     DISPLACEMENT: (("gas", ""), ("drive", ""), ("absorber", ""), ("light", ""), ("t", "")),
     FORCE: (("gas", ""), ("drive", ""), ("light", ""), ("t", "")),
 }
+OF_MEMBRANE, OF_METER = (LAG, DAHL, SLIP, DELAY, OSCILLATION), (FOLLOWER, DELAY)
+MEMORIES = {DISPLACEMENT: ("gas", OF_MEMBRANE), FORCE: ("gas", OF_MEMBRANE), TEMPERATURE: ("absorber", OF_METER)}
+"""What a signal may remember: membranes creep, slip, ring and are late, thermometers lag or are late."""
 
 
 def compute_rates(t: Any, state: Any, u: Any, p: Any) -> Sequence[Any]:
@@ -76,6 +80,7 @@ def build_model(base: Sequence[float], measured: Sequence[str]) -> OdeModel:
     } | {"tau_m": Parameter(*MEMORY_S)}
     places = [("dabsorber/dt", *place) for place in ABSORBER_PLACES] + [("dgas/dt", *place) for place in GAS_PLACES]
     places += [(output, *place) for output in OUTPUTS if output in measured for place in OUTPUT_PLACES[output]]
+    memories = [(output, *MEMORIES[output]) for output in OUTPUTS if output in measured]
     return OdeModel(
         states=("absorber", "gas", "memory"),
         inputs=INPUTS,
@@ -87,5 +92,7 @@ def build_model(base: Sequence[float], measured: Sequence[str]) -> OdeModel:
         quantities=("heating", "drive", "since_opening", "since_closing"),
         quantity=compute_quantities,
         places=tuple(places),
+        memories=(*memories, ("dgas/dt", "gas", (FOLLOWER,))),
+        followers=("memory",),
         from_rest=True,
     )

@@ -9,6 +9,7 @@ from optodrive.core.toml_model import build_input_error
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.prediction import EPSILON
 from optodrive.lab.discovery import Curve
+from optodrive.lab.discovery.memory import KINDS
 from optodrive.lab.pixel_discovery.findings import PixelDiscovery, PixelFinding
 from optodrive.lab.pixel_discovery.pixel_model import AFTER, LIGHT
 from optodrive.physics.discovered_term import KNOTS, UNITS, DiscoveredTerm
@@ -45,6 +46,8 @@ def build_planned_terms(discovery: PixelDiscovery) -> PlannedTerms:
             refused.append("the light changes at random, otherwise in every run")
         elif AFTER in finding.term.chosen.depends_on:
             refused.append("light after the gate has closed has no bound in the limiter")
+        elif finding.term.chosen.kind in KINDS:
+            refused.append(f"{finding.term.chosen.formula} depends on the past, which a plan does not simulate")
         elif _acts_when_cold(finding, finding.curve):
             refused.append(f"{finding.term.chosen.formula} acts on a pixel without light")
         else:

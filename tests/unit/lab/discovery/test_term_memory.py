@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from optodrive.lab.discovery import OdeModel, Parameter, Record
 from optodrive.lab.discovery.fitting import Point, Simulation, Terms
 from optodrive.lab.discovery.forms import POWER
-from optodrive.lab.discovery.memory import DAHL, DELAY, FOLLOWER, LAG, SLIP, remember
+from optodrive.lab.discovery.memory import DAHL, DELAY, FOLLOWER, LAG, OSCILLATION, SLIP, START_DAMPING, remember
 
 T_S = 0.05 * np.arange(400)
 SCALE = 0.3
@@ -71,6 +71,29 @@ def test_a_term_with_memory_of_a_state_in_free_run(kind):
     found, states = simulation.run(record, Point(np.array([1.0]), terms))
     assert found[:, 0] == pytest.approx(np.array(expected)[::50], abs=3e-3)
     assert states.shape == (len(T_S), 2)
+
+
+def test_an_oscillation_along_a_variable_and_in_free_run():
+    def rate(time, state):
+        x, m, v = state
+        pull = (x - m) / SCALE**2 - 2.0 * START_DAMPING * v / SCALE
+        return [drive(time) - x, v, pull]
+
+    x, m, _ = solve_ivp(rate, (0.0, T_S[-1]), [0.5, 0.5, 0.0], t_eval=T_S, rtol=1e-8, atol=1e-10).y
+    # Along the samples the variable is taken as linear between them.
+    assert remember(OSCILLATION, SCALE, T_S, x) == pytest.approx(m - x, abs=0.01)
+    terms = Terms(
+        np.array([[1, POWER, 0, -1, OSCILLATION]]),
+        np.array([[0.7, 1.0, START_DAMPING, SCALE]]),
+        np.ones((1, 4), dtype=bool),
+        np.full((1, 4), -np.inf),
+        np.full((1, 4), np.inf),
+    )
+    simulation = Simulation(MODEL, h_max=0.01, hold=2)
+    record = Record(T_S, drive(T_S), np.zeros(len(T_S)))
+    found, states = simulation.run(record, Point(np.array([1.0]), terms))
+    assert found[:, 0] == pytest.approx(x + 0.7 * (m - x), abs=1e-3)
+    assert states.shape == (len(T_S), 3)
 
 
 def test_a_delay_of_an_input_is_smooth_between_samples():
