@@ -116,16 +116,18 @@ def plan_proposal(display: DisplayModel, proposal: NextExperiment) -> Experiment
 def plan_experiment(display: DisplayModel, name: str, pulses: FloatArray, pixel: int) -> Experiment:
     """Plan pulses [n, 4], with less power where a cap of the cold display asks for it.
 
-    Raises RefusedError if even a small fraction of the power exceeds a cap.
+    Raises RefusedError if even a small fraction of the power exceeds a cap, or the laser does not emit it.
     """
     share = 1.0
     while True:
+        if share * pulses[:, 2].min() < display.config.min_power_w:
+            raise RefusedError(f"{name}: a pulse within the caps is weaker than the laser emits")
         try:
             plan = _plan_pulses(display, pulses * [1.0, 1.0, share, 1.0])
             break
         except RefusedError:
             share *= POWER_STEP
-            if share < POWER_MIN or share * pulses[:, 2].min() < display.config.min_power_w:
+            if share < POWER_MIN:
                 raise
     planned = np.column_stack([plan.start_s - plan.start_s[0] + LEAD_S, plan.width_s, plan.power_w, plan.pixel])
     tail_s = TRAIN_TAIL_S if len(planned) >= TRAIN_PULSES else TAIL_S

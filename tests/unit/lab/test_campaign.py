@@ -22,6 +22,7 @@ from optodrive.lab.live_diagnosis import (
     plan_proposal,
     run_campaign,
 )
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import limit
 
 DISPLAY = DISPLAYS["display-16"]
@@ -141,6 +142,24 @@ def test_first_experiments_fit_every_cap_of_every_display(name):
         assert not limited.trimmed_j.any()
         assert experiment.pulses[0, 0] == pytest.approx(LEAD_S)
         assert experiment.span_s > experiment.pulses[-1, 0] + experiment.pulses[-1, 1]
+
+
+def use_laser(**keys):
+    """Return the display with another laser."""
+    table = DISPLAY.config.model_dump()
+    config = type(DISPLAY.config).model_validate(table | {"laser": table["laser"] | keys})
+    return DisplayModel.from_config(config)
+
+
+def test_no_experiment_is_weaker_than_the_laser_emits():
+    weak = use_laser(threshold_w=1.0)
+    for experiment in plan_first_experiments(weak, *PIXELS).values():
+        assert experiment.plan.power_w.min() >= 1.0
+    below = np.array([[0.02, 0.05, 0.9, PIXELS[0]]])
+    with pytest.raises(RefusedError, match="weaker"):
+        plan_experiment(weak, "dark", below, PIXELS[0])
+    with pytest.raises(InputError, match=r"laser\.modulation: got 'on_off', expected 'pwm': a diagnosis"):
+        plan_first_experiments(use_laser(modulation="on_off"), *PIXELS)
 
 
 def test_a_proposal_above_a_cap_is_played_with_less_power():

@@ -10,7 +10,7 @@ from exclusive_rig import ExclusiveRig
 from optodrive.cli.calibrate.pixels import _build_displays
 from optodrive.core.errors import BoardFaultError, InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.device.config import build_pixel_layout
+from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_file import load_config
 from optodrive.device.field_loader import load_scan_field
 from optodrive.lab.calibration.pixel_sweep import (
@@ -195,3 +195,25 @@ def test_the_files_of_a_sweep_move_only_the_pixels_that_they_pulse():
     assert np.all(layout.x_m[~reached] == layout.x_m.max())
     assert np.array_equal(build_aim_map(aim, reached).offset_x_m, np.where(reached, 0.0012, 0.0))
     assert {train.pixel for train in build_sweep(config, aim, reached)} == set(np.flatnonzero(reached).tolist())
+
+
+def use_laser(**keys):
+    """Return the configuration of a small display with another laser."""
+    table = load_config("display-16").model_dump()
+    return Config.model_validate(table | {"laser": table["laser"] | keys})
+
+
+def test_pulses_of_a_laser_that_is_on_or_off_are_short_instead_of_weak():
+    config = use_laser(modulation="on_off")
+    aims = list_aims(config)
+    for aim in aims:
+        width_s, power_w = compute_pulse(config, aim)
+        assert power_w == config.laser.max_power_w
+        assert width_s * 1e6 == pytest.approx(round(width_s * 1e6))
+        # A wall takes no more than the surface of a half-space does at the same rise: power times the root of time.
+        weak_s, weak_w = compute_pulse(load_config("display-16"), aim)
+        if aim.name != "middle":
+            assert width_s < weak_s
+            assert power_w * width_s**0.5 <= weak_w * weak_s**0.5 * 1.5
+    with pytest.raises(InputError, match=r"laser\.threshold_w: got 0\.4, expected at most 0\.188 W across the edge"):
+        compute_pulse(use_laser(threshold_w=0.4), aims[1])

@@ -9,6 +9,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.errors import InputError, OverBudgetError, RefusedError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility import order_search
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.feasibility.reduction import omit_pixels, scale_sequence, stretch_sequence
@@ -248,3 +249,18 @@ def test_a_height_train_takes_beam_time_from_a_frame():
     )
     assert check_feasibility(DISPLAY, lower, *DISPLAY.build_cold_state())[1].fits
     assert check(build_frame(range(30), 60, duration_s=0.14), trains=[train], fit="priority")[1].omitted
+
+
+def test_no_height_factor_makes_a_train_weaker_than_its_laser_emits():
+    """Dark, it would fit."""
+    train = PulseTrain(5, 0.0, 2.0, 0.04, 0.002, 2.45)
+    table = DISPLAYS["display-16"].config.model_dump()
+    factors = {}
+    for threshold_w in (0.0, 1.2, 2.4):
+        config = type(DISPLAY.config).model_validate(table | {"laser": table["laser"] | {"threshold_w": threshold_w}})
+        display = DisplayModel.from_config(config)
+        _, report = check_feasibility(display, FrameSequence(trains=(train,)), *display.build_cold_state())
+        assert not report.fits
+        factors[threshold_w] = report.nearest.height_factor
+    assert 0.0 < factors[0.0] < 1.2 / 2.45
+    assert factors[1.2] is factors[2.4] is None
