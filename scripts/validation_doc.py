@@ -144,7 +144,7 @@ def build_diagnosis_section():
 def keep_findings(lines):
     """Return the lines on the named causes, without those on the assumptions and on all other causes."""
     others = next((k for k, line in enumerate(lines) if line.startswith(("Assumptions", "Other causes"))), len(lines))
-    return [*lines[:others], "…"]
+    return [*(line for line in lines[:others] if "Evidence:" not in line), "…"]
 
 
 def format_quote(lines):

@@ -26,7 +26,7 @@ Interruptions. In a pause the board drops its queue; what was not executed becom
 waits at the front and is planned anew for the time at which the light returns (decision 37). A stream is dropped, as it
 shows the present. Points that would be late, and the loss of a stage where the others go on, interrupt as a pause does;
 of a stream the rest is then drawn, unless a newer frame waits already. Nobody knows what a lost board emitted: what it
-was sent for the time before it was dark for certain counts, and is not repeated (decision 49).
+was sent for the time before it was dark for certain counts, and is not repeated.
 """
 
 from collections.abc import Callable, Sequence

@@ -28,7 +28,7 @@ pixel's closed form and its integrator agree. If all repeats are equal to the la
 without noise: rounding errors are then equal in all runs, do not average out, and are taken as slow noise.
 
 Checks. `replicate_excess` says by how much repeats differ beyond the model (something changes between runs that it does
-not contain, or an effect shifts the jitters' sensitivities: decision 11). Above a threshold no cause is named.
+not contain, or an effect shifts the jitters' sensitivities). Above a threshold no cause is named.
 """
 
 from collections.abc import Callable

@@ -20,7 +20,7 @@ Control. Who armed the board controls it: an arming may be held by a client that
 and ends with it. One arming at a time; a second caller is told who arms.
 
 Pauses are numbered and held here, as STOP is, so that they take effect however busy the planner is (decision 37).
-Points that would be late, and the loss of a stage where the others go on (decision 49), are interruptions of the same
+Points that would be late, and the loss of a stage where the others go on, are interruptions of the same
 kind that end by themselves.
 
 Order of one `step`: bytes of the board first, then what follows from them (ends of epochs), then status, then the
@@ -30,7 +30,7 @@ is true.
 
 No method blocks and no client is waited for: the process has the highest priority of the daemon, its loop is bounded by
 `WAIT_MAX_S`, and `pop_outgoing` returns what is to be sent. Malformed messages end their client, not the loop. The
-interleavings are checked by a SPIN model (`firmware_protocol/model/epochs.pml`). Decisions: 26, 31, 35, 37.
+interleavings are checked by a SPIN model (`firmware_protocol/model/epochs.pml`). Decisions: 31, 35, 37.
 """
 
 from typing import Any, NamedTuple

@@ -26,7 +26,7 @@ width is for heat that has decayed, and light out of order is not covered by any
 Streams are cut at one time on all boards, behind every point that may have left; a splice is made on all or, if it is
 too late on one, on none.
 
-Why one process. STOP, epochs and leases would otherwise have to agree across processes. Decisions: 41, 42, 49.
+Why one process. STOP, epochs and leases would otherwise have to agree across processes. Decisions: 41, 42.
 """
 
 from collections.abc import Callable, Sequence
