@@ -387,7 +387,7 @@ MUTANTS = {
     "heat that is counted": (QueueState, "_rewind", lambda state, *_: state, withdraw_the_first),
     "heat that is not": (QueueState, "_rewind", lambda state, ended, *_: state._go_back(ended[0]), withdraw_the_first),
     "light that is missing": (QueueState, "_drop_from", lambda state, row: state.running, stream_four),
-    "p2, pixel": (QueueState, "accept", lambda state, plan: KEPT_ACCEPT(state, plan).know(state.thermal), accept_two),
+    "not counted": (QueueState, "accept", lambda state, plan: KEPT_ACCEPT(state, plan).know(state.thermal), accept_two),
 }
 """What the judge says, the transition with its mutant, and what happens."""
 

@@ -215,19 +215,59 @@ def test_a_frame_whose_end_came_after_the_board_had_ended_the_job_is_drawn(monke
 def find_worst_interval(rig, count, rate_hz):
     """Return the largest deviation of an interval between two pulses of a pixel, in periods, by the board's log."""
     rig.stream(choose_pixels(count), rate_hz, 12 / rate_hz).finish()
+    return find_deviations(rig, count, rate_hz, 3).max()
+
+
+def find_deviations(rig, count, rate_hz, settled):
+    """Return the deviations of the intervals between two pulses of a pixel, in periods, by the board's log.
+
+    settled: number of the first intervals, in which the time reserved for planning and the rhythm settle
+    """
     pulses = [event for event in rig.log if event["event"] == "pulse"]
     places = np.array([(event["x"], event["y"]) for event in pulses])
     on_s = rig.list_gate_times_s()[:, 0]
     names = np.unique(places, axis=0, return_inverse=True)[1].ravel()
-    # The time reserved for planning settles in the first intervals.
-    intervals = np.concatenate([np.diff(on_s[names == name])[3:] for name in range(count)]) * rate_hz
-    return float(np.abs(intervals - 1.0).max())
+    return np.abs(np.concatenate([np.diff(on_s[names == name])[settled:] for name in range(count)]) * rate_hz - 1.0)
 
 
 @pytest.mark.parametrize(("count", "rate_hz"), [(4, 20.0), (4, 50.0), nightly(1, 30.0), nightly(12, 10.0), (20, 5.0)])
 def test_a_frame_that_is_streamed_again_keeps_the_period_of_each_pixel(monkeypatch, count, rate_hz):
     # The rig notices an arrival within a step.
     assert find_worst_interval(StreamRig(monkeypatch), count, rate_hz) < 0.05 + STEP_S * rate_hz
+
+
+SOURCE_JITTER_S, PLANNING_S = 0.003, (0.002, 0.003, 0.004, 0.005)
+
+
+def stream_unevenly(monkeypatch, count, rate_hz):
+    """Stream 30 equal frames, unevenly. Return the worst deviation of a pixel's interval, in periods, and the rig."""
+    rng, rig = np.random.default_rng(0), StreamRig(monkeypatch)
+    make_plan_at_once = rig._make_plan
+
+    def plan_unevenly(*arguments):
+        rig._planning_s = float(rng.choice(PLANNING_S))
+        return make_plan_at_once(*arguments)
+
+    monkeypatch.setattr(planner_module, "make_plan", plan_unevenly)
+    begin_s, late_s = rig.clock.now_s() + 0.02, rng.uniform(0.0, SOURCE_JITTER_S, 30)
+    for number in range(30):
+        rig.until(lambda: rig.clock.now_s() >= begin_s + number / rate_hz + late_s[number])  # noqa: B023 - at once
+        rig.stream(choose_pixels(count), 1e9, 1e-9)
+    rig.finish()
+    return find_deviations(rig, count, rate_hz, 8).max(), rig
+
+
+@pytest.mark.parametrize(("count", "rate_hz"), [(4, 20.0), (1, 30.0), (6, 30.0), (4, 40.0), (4, 60.0)])
+def test_a_frame_that_comes_again_keeps_its_period_though_source_and_planning_do_not(monkeypatch, count, rate_hz):
+    deviation, rig = stream_unevenly(monkeypatch, count, rate_hz)
+    assert deviation < 0.05
+    assert max(rig.list_ages_s()) < LEADS_S
+
+
+def test_frames_that_begin_as_they_arrive_are_caught(monkeypatch):
+    """Mutant: a frame does not wait for its beat."""
+    monkeypatch.setattr(RefreshCycle, "find_beat_s", lambda cycle, first, interval_s, ready_s: ready_s)
+    assert stream_unevenly(monkeypatch, 4, 60.0)[0] > 0.15
 
 
 def test_a_path_that_reverses_from_frame_to_frame_is_caught(monkeypatch):

@@ -195,23 +195,23 @@ def play(monkeypatch, seed):
     return judge(Scene(monkeypatch, seed).run())
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [*range(12), 230])
 def test_pulses_of_late_plans_reach_their_heights(monkeypatch, seed):
     play(monkeypatch, seed)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_pulses_of_a_thousand_late_scenes_reach_their_heights(monkeypatch):
+def test_pulses_of_many_late_scenes_reach_their_heights(monkeypatch):
     count = 0
-    for seed in range(100, 1100):
+    for seed in range(100, 500):
         with monkeypatch.context() as patches:
             try:
                 count += play(patches, seed)
             except BaseException as error:
                 error.add_note(f"seed {seed}")
                 raise
-    assert count > 30_000
+    assert count > 20_000
 
 
 def plan_for_older_heat(display, sequence, heat, *arguments):

@@ -24,6 +24,8 @@ from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.pulse_table import PulseTable
 
+RHYTHM_WAIT_MAX_S = 0.02
+"""Longest time for which a frame that comes again waits for its beat, so that late ones do not shift it."""
 CUT_MIN_S = 1e-5
 """A pulse that is shorter than planned by more than this was cut short."""
 
@@ -77,6 +79,17 @@ class RefreshCycle(NamedTuple):
         if not len(active) or np.count_nonzero(self.drawn_s >= drawn_s.min()) != len(active):
             return None
         return np.asarray(active[np.argsort(drawn_s, kind="stable")], dtype=np.int64)
+
+    def find_beat_s(self, first: int, interval_s: float, ready_s: float) -> float:
+        """Return the board time at which a frame that comes again begins with its first pixel, in its rhythm so far.
+
+        interval_s: mean interval between frames; ready_s: board time at which it may begin, and does if it is late
+        """
+        if not np.isfinite(interval_s - self.pulsed_s[first]):  # the second frame, or a pixel that heat held up
+            return ready_s
+        beats = np.ceil((ready_s - self.pulsed_s[first]) / interval_s)
+        wait_s = float(self.pulsed_s[first] + max(1.0, beats) * interval_s - ready_s)
+        return ready_s + wait_s if wait_s < min(RHYTHM_WAIT_MAX_S, 0.5 * interval_s) else ready_s
 
 
 class PlanRows(NamedTuple):

@@ -61,6 +61,28 @@ class PlanningSnapshot:
     cycle: RefreshCycle | None = None
     pause_s: float = 0.0
 
+    @property
+    def is_beam_free(self) -> bool:
+        """Whether the plan begins behind a pause, or follows nothing."""
+        return self.predecessor is None or self.pause_s > 0.0
+
+    def await_beat(self, display: DisplayModel, sequence: FrameSequence, interval_s: float) -> "PlanningSnapshot":
+        """Return the snapshot for a streamed frame that begins in its rhythm, if the frame before had the same pixels.
+
+        interval_s: mean interval between frames
+        """
+        order = self.cycle.find_order(sequence.frames[0].target_m) if self.cycle and sequence.frames else None
+        if self.cycle is None or order is None or not self.is_beam_free:
+            return self
+        # Without known mirrors the plan's own lead-in comes first.
+        lead_ins_us = [0] if self.initial_pixels else [head.settling.lead_in_us for head in display.scan_heads]
+        ready_s = self.start_s + self.pause_s + 1e-6 * max(lead_ins_us)
+        wait_s = float(np.floor((self.cycle.find_beat_s(int(order[0]), interval_s, ready_s) - ready_s) * 1e6)) * 1e-6
+        if self.predecessor is not None:
+            return replace(self, pause_s=self.pause_s + wait_s)
+        # A later zero leaves the planning as much more time.
+        return replace(self, start_s=self.start_s + wait_s, before=self.before.shift(-wait_s))
+
 
 def build_cut_snapshot(
     running: ActivePlan,
@@ -253,6 +275,7 @@ class PlanningRequest(NamedTuple):
 
     build: returns the sequence, with labels and parameters for report and recording
     arrived_s: board time of the push's arrival; caller_left: set when the caller no longer waits
+    interval_s: mean interval between the latest frames of its stream, infinity without
     select: returns what is drawn next of a sequence that is a standing page, None for any other sequence
     """
 
@@ -261,6 +284,7 @@ class PlanningRequest(NamedTuple):
     arrived_s: float = 0.0
     caller_left: threading.Event = NEVER
     select: Callable[[DisplayModel, FrameSequence, PlanningSnapshot], Refresh] | None = None
+    interval_s: float = inf
 
 
 def make_plan(
@@ -281,6 +305,8 @@ def make_plan(
     push = request.push
     growth, feasibility = None, None
     if push.streamed:
+        if request.select is None:
+            snapshot = snapshot.await_beat(display, built.sequence, request.interval_s)
         growth = _begin_streamed(display, request, built.sequence, snapshot, on_progress)
         # What leaves the range of a discovered term's data is refused as a whole, before any of it is played.
         is_whole = request.select is not None or display.parameters.discovered
@@ -339,8 +365,7 @@ def _begin_streamed(
         sequence, orders = request.select(display, sequence, snapshot)
     elif snapshot.cycle is not None and can_split(sequence):
         sequence = stale_pixels_first(sequence, snapshot.cycle.refreshed)
-        is_beam_free = snapshot.predecessor is None or snapshot.pause_s > 0.0
-        order = snapshot.cycle.find_order(sequence.frames[0].target_m) if is_beam_free else None
+        order = snapshot.cycle.find_order(sequence.frames[0].target_m) if snapshot.is_beam_free else None
         if order is not None and len(sequence.frames) == 1:
             orders = {0: order}
     if snapshot.pause_s and request.select is None:

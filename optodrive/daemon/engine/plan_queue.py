@@ -270,8 +270,8 @@ class PlanQueue:
             if plan.first_row or plan.before.compute_cooling_m(0.0, delay_s) > COOLING_MAX_M:
                 self._apply(state.hold(now_s))
                 return
-            state = state.delay(delay_s)
-            plan = state.waiting[0]
+            self._apply(state.delay(delay_s))  # before it has a job, which would be delayed once more
+            state, plan = self.state, self.state.waiting[0]
         job = None
         if plan.rest_count:
             ahead_s = self.lead_s if plan.record.streamed else inf

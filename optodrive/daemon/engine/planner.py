@@ -5,8 +5,9 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import suppress
-from itertools import count
+from itertools import count, pairwise
 from math import inf
+from statistics import fmean
 from time import thread_time
 from typing import Any, Protocol, TypeVar
 
@@ -32,16 +33,30 @@ HORIZON_INTERVALS = 1.5
 """The same, in intervals between two frames: a frame that comes somewhat later than expected finds it unspent."""
 
 
+ARRIVALS_KEPT = 17
+PAUSE_SHARE = 1.5
+"""An interval longer than this share of the median is a pause of the stream, and does not count in the mean."""
+
+
 class StreamHorizon:
     """Time of a streamed frame's light that is planned at once, from the interval between the last two frames."""
 
     def __init__(self) -> None:
-        self._arrived_s = -inf
+        self._arrivals_s = deque([-inf], ARRIVALS_KEPT)
 
     def follow(self, arrived_s: float) -> float:
         """Return the time for the frame that arrived now, s."""
-        interval_s, self._arrived_s = arrived_s - self._arrived_s, arrived_s
+        interval_s = arrived_s - self._arrivals_s[-1]
+        if interval_s > 0.0:  # else the rest of a frame
+            self._arrivals_s.append(arrived_s)
         return min(HORIZON_MAX_S, max(HORIZON_MIN_S, HORIZON_INTERVALS * interval_s))
+
+    @property
+    def mean_interval_s(self) -> float:
+        """Mean interval between the latest of the frames followed, s, infinity before the second one."""
+        intervals_s = sorted(after - before for before, after in pairwise(self._arrivals_s)) or [inf]
+        median_s = intervals_s[(len(intervals_s) - 1) // 2]
+        return fmean(each for each in intervals_s if each <= PAUSE_SHARE * median_s)
 
 
 class PlanningTime:
@@ -309,6 +324,7 @@ class Planner:
         if request.push.streamed:
             reserved_s = self._growth_time.compute_reserved_s(0) + GROWTH_MARGIN_S
             horizon_s = max(self._horizon.follow(request.arrived_s), self._plan_queue.lead_s) + reserved_s
+            request = request._replace(interval_s=self._horizon.mean_interval_s)
         else:
             self._grow()  # what is pushed goes behind the whole of a frame
         while True:
