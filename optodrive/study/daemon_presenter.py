@@ -6,13 +6,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from optodrive.client.display import Display
-from optodrive.client.plan import Plan
+from optodrive.client.plan import Plan, report_loss
 from optodrive.core.errors import RefusedError
 from optodrive.study.presenter import (
     TIME_TOLERANCE_S,
+    OnBegin,
     Presentation,
     RequestedStimulus,
     build_empty_presentation,
+    ignore_begin,
     place_intervals,
 )
 from optodrive.study.trial_stimulus import TrialStimulus
@@ -27,16 +29,21 @@ class DaemonPresenter:
     def __init__(self, display: Display, labels: Mapping[str, str | int | float | bool]) -> None:
         self._display, self._labels, self.config = display, labels, display.config()
 
-    def present(self, stimulus: TrialStimulus) -> Presentation:
+    def present(self, stimulus: TrialStimulus, on_begin: OnBegin = ignore_begin) -> Presentation:
         """Play a stimulus and wait for its end. Raise the daemon's error if it is refused or fails.
 
         Raise RefusedError if the daemon runs on another computer: response times need one clock.
         """
         called_s = time.monotonic()
         if stimulus.sequence is None:
+            on_begin(called_s)
             time.sleep(stimulus.duration_s)
             return place_intervals(stimulus, build_empty_presentation(called_s))
-        plan = self._display.push(stimulus.to_body(), labels=self._labels, policy="refuse")
+        plan = self._display.push(stimulus.to_body(), labels=self._labels, policy="refuse", wait=False)
+        if plan.onset is not None:
+            on_begin(plan.onset.monotonic_s - stimulus.first_start_s)
+        with report_loss(plan.plan):
+            plan = self._display.wait(plan)
         if plan.onset is not None and not called_s <= plan.onset.monotonic_s <= time.monotonic():
             raise RefusedError("the daemon's clock is not that of this computer: run the study where the daemon runs")
         columns = plan.executed_pulses

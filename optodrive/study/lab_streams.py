@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from optodrive.core.extras import import_extra
-from optodrive.study.presenter import Presentation, Presenter
+from optodrive.study.presenter import OnBegin, Presentation, Presenter, ignore_begin
 from optodrive.study.trial_stimulus import TrialStimulus
 
 PULSE_CHANNELS = (("pixel", ""), ("width", "s"), ("power", "W"), ("board_time", "s"))
@@ -72,9 +72,9 @@ class PublishingPresenter:
     def __init__(self, presenter: Presenter, streams: LabStreams) -> None:
         self._presenter, self._streams, self.config = presenter, streams, presenter.config
 
-    def present(self, stimulus: TrialStimulus) -> Presentation:
+    def present(self, stimulus: TrialStimulus, on_begin: OnBegin = ignore_begin) -> Presentation:
         """Show a stimulus and publish the executed pulses."""
-        shown = self._presenter.present(stimulus)
+        shown = self._presenter.present(stimulus, on_begin)
         self._streams.publish_pulses(shown)
         return shown
 

@@ -101,6 +101,7 @@ class ParticipantView(JsonModel):
     example: number of the example and of all; announced: the presentation that answers are about
     is_early: there was an answer before the stimulus had ended; answered: the answer that was noted last
     has_missed: there was no answer in time; follows: what comes after a trial, None until that is known
+    parts: beginning and end of each interval of the stimulus, s after this view was built; none of a single one
     is_correct, correct: feedback to the last answer; is_begun: the participant was ready before
     texts: the sentences of the page by key
     """
@@ -121,6 +122,7 @@ class ParticipantView(JsonModel):
     trials: int
     has_missed: bool
     follows: Literal["stimulus", "break", "end"] | None
+    parts: tuple[tuple[float, float], ...]
     is_correct: bool | None
     correct: str | None
     example: tuple[int, int] | None

@@ -40,6 +40,7 @@ from optodrive.study.session import Follows, RepeatReason, Respondent, Response
 from optodrive.study.study_file import Study
 from optodrive.study.study_sections import QuestionSection, Value
 from optodrive.study.trial_list import ListedTrial, is_practice_over
+from optodrive.study.trial_stimulus import IntervalTimes
 
 INPUTS_MAX = 100
 """Answers that are kept from the announcement of a stimulus to its end. Further ones are dropped."""
@@ -83,6 +84,7 @@ class PageRespondent(Respondent):
         self._feedback: tuple[bool | None, str | None] = (None, None)
         self._is_open = self._is_interrupted = False
         self._inputs: list[_Input] = []
+        self._parts: list[tuple[float, float]] = []
         self._early_answers = 0
         self._noted: str | float | None = None
         self._has_missed = False
@@ -148,11 +150,20 @@ class PageRespondent(Respondent):
             self._listed, self._is_practice = listed, listed.phase == "practice"
             self._has_missed, self._follows, self._feedback = False, None, (None, None)
             self._condition, self._executed, self._noted, self._example = dict(condition), None, None, None
-            self._is_open, self._inputs = False, []
+            self._is_open, self._inputs, self._parts = False, [], []
             self._is_interrupted = not self._is_ready
             if presentation == 1:
                 self._early_answers = 0
             self._notify()
+
+    def show_parts(self, intervals: Sequence[IntervalTimes], begin_monotonic_s: float) -> None:
+        """Mark the intervals of the announced stimulus on the page."""
+        with self._changed:
+            if len(intervals) > 1:
+                self._parts = [
+                    (begin_monotonic_s + start_s, begin_monotonic_s + end_s) for _, start_s, end_s in intervals
+                ]
+                self._notify()
 
     def withdraw(self, fault: str) -> None:
         """Drop the announced stimulus and its answers."""
@@ -281,6 +292,7 @@ class PageRespondent(Respondent):
         with self._changed:
             if connection != self._connection:
                 return None
+            now_s = time.monotonic()
             return ParticipantView(
                 phase=self._find_phase(),
                 title=study.title,
@@ -298,6 +310,7 @@ class PageRespondent(Respondent):
                 trials=study.trial_count,
                 has_missed=self._has_missed,
                 follows=self._follows,
+                parts=tuple((start_s - now_s, end_s - now_s) for start_s, end_s in self._parts),
                 is_correct=self._feedback[0],
                 correct=self._feedback[1],
                 example=self._example,

@@ -1,5 +1,6 @@
 """Presentation of stimuli and its interface, and simulated boards in virtual time that present them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -106,6 +107,14 @@ def build_empty_presentation(onset_monotonic_s: float | None) -> Presentation:
     return Presentation(None, np.zeros(0, dtype=np.int64), none, none, none, None, 0.0, onset_monotonic_s)
 
 
+OnBegin = Callable[[float], None]
+"""Gets the time of CLOCK_MONOTONIC at which a stimulus begins, s, before it does."""
+
+
+def ignore_begin(begin_monotonic_s: float) -> None:
+    """Do nothing."""
+
+
 class Presenter(Protocol):
     """Interface of a display that shows stimuli."""
 
@@ -113,7 +122,7 @@ class Presenter(Protocol):
     def config(self) -> Config:
         """Configuration of the display."""
 
-    def present(self, stimulus: TrialStimulus) -> Presentation:
+    def present(self, stimulus: TrialStimulus, on_begin: OnBegin = ignore_begin) -> Presentation:
         """Show a stimulus and wait for its end. Raise an OptodriveError if it cannot be shown."""
 
     def wait(self, duration_s: float) -> None:
@@ -129,8 +138,9 @@ class VirtualPresenter:
         self._heat, self._budget = display.build_cold_state()
         self._zero_s = self._boards.now_s  # of heat and budget
 
-    def present(self, stimulus: TrialStimulus) -> Presentation:
+    def present(self, stimulus: TrialStimulus, on_begin: OnBegin = ignore_begin) -> Presentation:
         """Show a stimulus. Raise RefusedError if the display stays too warm for it, and BoardFaultError."""
+        del on_begin  # nobody watches a clock in virtual time
         if stimulus.sequence is None:
             self._boards.wait(stimulus.duration_s)
             return place_intervals(stimulus, build_empty_presentation(None))

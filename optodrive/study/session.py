@@ -4,7 +4,7 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -19,7 +19,13 @@ from optodrive.study.study_sections import MatchingSection, ProcedureSection, Qu
 from optodrive.study.threshold import ThresholdModel, select_staircase_level
 from optodrive.study.trial_list import ListedTrial
 from optodrive.study.trial_log import TrialLog
-from optodrive.study.trial_stimulus import TrialStimulus, build_stimulus, find_chosen_interval, find_correct_answer
+from optodrive.study.trial_stimulus import (
+    IntervalTimes,
+    TrialStimulus,
+    build_stimulus,
+    find_chosen_interval,
+    find_correct_answer,
+)
 
 ATTEMPTS_MAX = 5
 """Largest number of attempts at one trial within a run; a stimulus that always fails is a fault of the display."""
@@ -81,6 +87,9 @@ class Respondent:
     def fill_in(self, questions: Sequence[QuestionSection]) -> dict[str, Any]:
         """Return the answers to a questionnaire, by the names of the questions."""
         raise NotImplementedError
+
+    def show_parts(self, intervals: Sequence[IntervalTimes], begin_monotonic_s: float) -> None:
+        """Tell when the intervals of the announced stimulus come: their times count from its beginning."""
 
     def withdraw(self, fault: str) -> None:
         """Tell that the announced stimulus was not as requested: there is no question about it."""
@@ -267,7 +276,7 @@ def _run_trial(
         presentations: list[dict[str, Any]] = []
         while True:
             respondent.announce(trial, attempt, len(presentations) + 1, listed, condition)
-            shown = presenter.present(stimulus)
+            shown = presenter.present(stimulus, partial(respondent.show_parts, stimulus.intervals))
             if shown.fault is not None:
                 break
             response = respondent.respond(shown, trial, attempt)

@@ -61,7 +61,7 @@ class PlannedPresenter:
 
     config = DISPLAY.config
 
-    def present(self, stimulus):
+    def present(self, stimulus, on_begin):
         plan = check_feasibility(DISPLAY, stimulus.sequence, *DISPLAY.build_cold_state(), policy="refuse")[0].plan
         return Presentation(0.0, plan.pixel, plan.start_s - plan.start_s[0], plan.width_s, plan.power_w, None)
 

@@ -19,6 +19,7 @@ let view = null;
 let said = "";
 let place = "";
 let texts = ENGLISH;
+let marks = [];
 
 const answers = new Answers(
   find,
@@ -122,8 +123,18 @@ function onView({ view: number, ...newest }) {
     place = newPlace;
     answers.reset(sayText("no_answer_yet"));
   }
+  markParts(phase);
   say(phase, state, hint);
   keepFocus(phase);
+}
+
+// Show the number of each interval of the stimulus while it lasts.
+function markParts(phase) {
+  marks.forEach(clearTimeout);
+  marks = (phase === "stimulus" ? view.parts : []).flatMap(([startS, endS], index) => [
+    endS > 0 && setTimeout(() => (find("state").textContent = sayText("part", { number: index + 1 })), 1000 * startS),
+    endS > 0 && setTimeout(() => (find("state").textContent = sayText("feel")), 1000 * endS),
+  ]);
 }
 
 function showTexts() {

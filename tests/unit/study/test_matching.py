@@ -98,11 +98,11 @@ class EndingPresenter(VirtualPresenter):
 
     presentations_left = 10**6
 
-    def present(self, stimulus):
+    def present(self, stimulus, on_begin):
         self.presentations_left -= 1
         if self.presentations_left < 0:
             raise KeyboardInterrupt
-        return super().present(stimulus)
+        return super().present(stimulus, on_begin)
 
 
 def write_study(folder, trials=TRIALS):

@@ -1,6 +1,7 @@
 """The participant on a page: which answers count, when a session waits, and what each page is shown."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from optodrive.study.presenter import Presentation
 from optodrive.study.session import RepeatReason, Response
 from optodrive.study.study_file import load_study
 from optodrive.study.trial_list import ListedTrial
+from optodrive.study.trial_stimulus import IntervalTimes
 
 CHOICE, MAGNITUDE = load_study("experiment-1"), load_study("experiment-4")
 ONSET_S, DURATION_S = 100.0, 2.0
@@ -226,6 +228,18 @@ def test_a_stimulus_that_was_not_as_requested_has_no_question_and_the_operator_r
     respondent.announce(0, 2, 1, LISTED, CONDITION)
     respondent.receive(respondent.page, say("up", attempt=2), END_S + 1.0, None)
     assert respondent.respond(present(), 0, 2).answer == "up"
+
+
+def test_the_parts_of_a_stimulus_are_marked_until_the_next_one(respondent):
+    now_s = time.monotonic()
+    respondent.show_parts([IntervalTimes("", 0.0, 0.5)], now_s)
+    assert respondent.build_participant_view(respondent.page).parts == ()
+    respondent.show_parts([IntervalTimes("a", 0.0, 0.5), IntervalTimes("b", 1.0, 1.5)], now_s)
+    (first, first_end), (second, second_end) = respondent.build_participant_view(respondent.page).parts
+    assert first <= 0.0
+    assert (first_end - first, second - first, second_end - first) == pytest.approx((0.5, 1.0, 1.5))
+    respondent.announce(1, 1, 1, LISTED, CONDITION)
+    assert respondent.build_participant_view(respondent.page).parts == ()
 
 
 def test_the_participant_is_never_shown_a_condition(respondent):

@@ -44,8 +44,8 @@ class FaultyPresenter(VirtualPresenter):
 
     faults = 0
 
-    def present(self, stimulus):
-        shown = super().present(stimulus)
+    def present(self, stimulus, on_begin):
+        shown = super().present(stimulus, on_begin)
         self.faults -= 1
         return shown if self.faults < 0 else replace(shown, pixel=shown.pixel[:-1], fault="19 of 20 pulses executed")
 

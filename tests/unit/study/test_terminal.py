@@ -10,6 +10,7 @@ from optodrive.study.presenter import Presentation
 from optodrive.study.session import RepeatReason
 from optodrive.study.study_file import load_study
 from optodrive.study.terminal import TerminalRespondent
+from optodrive.study.trial_list import ListedTrial
 
 SHOWN = Presentation(0.0, np.array([1]), np.zeros(1), np.ones(1), np.ones(1), None, onset_monotonic_s=0.0)
 
@@ -71,3 +72,54 @@ def test_prompts_leave_stdout_to_the_report(capsys, monkeypatch):
     assert _read_line("On which side was it? ") == "left"
     output = capsys.readouterr()
     assert (output.out, output.err) == ("", "On which side was it? ")
+
+
+def make_respondent(study, lines):
+    said, left = [], iter(lines)
+
+    def read(prompt):
+        said.append(prompt)
+        return next(left)
+
+    return TerminalRespondent(study, read, said.append), said
+
+
+def test_labels_are_read_and_answers_recorded():
+    study = load_study("detection")
+    response = study.response.model_copy(update={"labels": ("links", "rechts"), "again": False})
+    german = study.model_copy(update={"response": response})
+    found, (prompt,) = respond(german, ["r"])
+    assert found == "right"
+    assert "links, rechts > " in prompt
+    found, prompts = respond(german, ["0", "l"])  # it cannot be felt again
+    assert found == "left"
+    assert prompts[1].startswith("'0' is no answer.")
+
+
+@pytest.mark.parametrize(("line", "answer"), [("12.5", 12.5), ("1e3", 1000.0)])
+def test_any_positive_number_is_an_answer_where_the_study_has_no_scale(line, answer):
+    found, _ = respond(load_study("roughness"), ["0", "-1", "nan", "inf", line])
+    assert found == answer
+
+
+def test_an_answer_after_the_longest_time_does_not_count():
+    study = load_study("detection")
+    late = study.model_copy(update={"response": study.response.model_copy(update={"max_s": 1e-9})})
+    found, prompts = respond(late, ["left"])
+    assert found is None
+    assert prompts[-1] == "There was no answer in time.\n"
+
+
+def test_practice_feedback_breaks_and_questions_are_said():
+    study = load_study("frequency-discrimination")
+    respondent, said = make_respondent(study, ["", "x", "nan", "31", "l", "both", "first"])
+    respondent.instruct(study.instructions)
+    respondent.take_break(None)
+    assert respondent.fill_in(study.questions[:2]) == {"age": 31.0, "hand": "left"}
+    respondent.announce(0, 1, 1, ListedTrial("practice", "practice", False, {}), {})
+    respondent.conclude("stimulus", False, "second")
+    assert said[-1] == "Not correct. The correct answer: second.\n"
+    assert "faster" in said[0]
+    assert said[1] == "Break: Enter > "
+    respondent.announce(24, 1, 1, ListedTrial("main", "main", False, {}), {})
+    assert respondent._number == "1 / 46"
