@@ -93,7 +93,7 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
             bandwidth_hz=config.scanner.bandwidth_hz,
             slew_rad_per_s=config.scanner.slew_rad_per_s,
             pulse_width_max_s=config.limits.pulse_width_max_s,
-            max_power_w=config.laser.max_power_w,
+            full_power_w=find_proportional_power_w(config.laser.max_power_w, config.laser.curve),
             pulse_energy_max_j=config.limits.pulse_energy_max_j,
             pixel_mean_power_max_w=config.limits.pixel_mean_power_max_w,
         ),

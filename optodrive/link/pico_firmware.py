@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from optodrive.core.errors import InputError, LinkError, Unquoted
+from optodrive.core.laser_power import find_proportional_power_w
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config import Config
 from optodrive.link.board_setup import SIMULATED_CELL_MAX_CODES, build_bench_requirements, permit_retiming
@@ -128,9 +129,15 @@ def list_origins(config: Config) -> dict[str, str]:
     def state(path: str | None, declared: str) -> str:
         return f"measured: {Path(path).name}" if path else f"declared: {declared}"
 
+    laser = config.laser
+    full_w = find_proportional_power_w(laser.max_power_w, laser.curve)
+    if laser.curve:
+        full_power = f"measured: laser.curve, whose largest ratio of power to duty is {format_quantity(full_w, 'W')}"
+    else:
+        full_power = f"declared: laser.max_power_w, {format_quantity(full_w, 'W')}; "
+        full_power += "a power meter at the sample must show it at full duty"
     return {
-        "full power": f"declared: laser.max_power_w, {format_quantity(config.laser.max_power_w, 'W')}; "
-        "a power meter at the sample must show it at full duty",
+        "full power": full_power,
         "range": state(scanner.field, "scanner.focal_length_m, range_rad and the pixels"),
         "settling": state(scanner.mirrors, "scanner.bandwidth_hz, damping, slew_rad_per_s, delay_s"),
         "spots": state(config.display.pixel_map, "the places of the pixels"),

@@ -80,7 +80,7 @@ class ConfiguredValues:
     bandwidth_hz: float
     slew_rad_per_s: float
     pulse_width_max_s: float
-    max_power_w: float
+    full_power_w: float
     pulse_energy_max_j: float
     pixel_mean_power_max_w: float
 
@@ -156,10 +156,11 @@ class BoardRequirements:
             # Neither number is known to be true: to follow the lower one would count less light than the diode emits.
             expected = (
                 f"the firmware's full power, now {limits.full_power_uw * 1e-6:g} W (by `optodrive board build`). "
-                "Both state the power at the sample at full duty: measure it there with a power meter, the board off, "
-                "the driver's input at full level, then set both to what is measured, and neither lower"
+                "Both state the power at the sample at full duty, of a laser.curve the largest ratio of power to duty: "
+                "measure it there with a power meter, the board off, the driver's input at full level, then set both "
+                "to what is measured, and neither lower"
             )
-            raise InputError("laser.max_power_w", values.max_power_w, expected, "board")
+            raise InputError("laser.max_power_w", values.full_power_w, expected, "board")
         # Compared with the configured value, not with the requested one, which is 5 % larger (`CAP_MARGIN`): that much
         # the board may lack.
         if limits.spot_uj < values.pulse_energy_max_j * 1e6:

@@ -225,6 +225,21 @@ def test_a_contradiction_about_full_power_names_both_sides_and_advises_neither_n
     assert line.endswith("set both to what is measured, and neither lower")
 
 
+def test_the_full_power_of_a_curve_is_what_the_board_must_count_with():
+    curve = ((0.0, 0.0), (0.5, 1.5), (1.0, 2.45))
+    config = changed("laser", curve=curve)
+    with pytest.raises(
+        InputError, match=r"laser\.max_power_w: got 3\.0, expected the firmware's full power, now 2\.45 W"
+    ):
+        Rig(BoardSettings(replace(DEFAULT_LIMITS, full_power_uw=2_450_000)), config).connect()
+    limits = build_board_requirements(config).limits
+    assert limits.full_power_uw == 3_000_000
+    # At full duty it counts 3.0 for 2.45 W.
+    plain = build_board_requirements(CONFIG).limits
+    assert limits.spot_uj == pytest.approx(plain.spot_uj * 3.0 / 2.45, abs=1)
+    assert limits.spot_leak_uw == pytest.approx(plain.spot_leak_uw * 3.0 / 2.45, abs=1)
+
+
 @pytest.mark.parametrize(("field", "value"), [("major", 2), ("tick_hz", 999)])
 def test_another_protocol_or_tick_is_rejected(field, value):
     requirements = build_board_requirements(CONFIG)
