@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from types import MappingProxyType
 
 from async_reference import MODELS
 
@@ -34,7 +35,8 @@ MODELS_HEAD = """## Models
 The JSON bodies: each member with its type and meaning. A member with `?` may be null. One without a type is a number if
 its name ends in a unit, a boolean if its meaning begins with "whether", else a string. Members of `Problem`,
 `FrameResult` and `HoldReport` that do not apply are absent; all other models always have all members. Of a model within
-a model the page says what its choices are and when a member is null; `/openapi.json` describes every member.
+a model the page says what its choices are and when a member is null. The [document](openapi.json) describes every
+member, and the models within those.
 """
 
 FILLERS = """a all an and any as at by each first for from has have if in index into is it of on or that the their them
@@ -82,14 +84,15 @@ def build_rest_reference():
             sections.append(format_route(f"{method.upper()} {path}", route, stated))
     sections.append(MODELS_HEAD)
     schemas = document["components"]["schemas"]
-    configured = {name for name in schemas if is_section(getattr(config_sections, name, None))}
-    outer = {name for name in schemas if f"(#{name.lower()})" in "".join(sections)} | {
-        model.__name__ for model in MODELS
-    }
+    elsewhere = {name: "configuration.md" for name in schemas if is_section(getattr(config_sections, name, None))}
+    routes = "".join(sections)
+    outer = {model.__name__ for model in MODELS} | {name for name in schemas if f"(#{name.lower()})" in routes}
+    inner = {name for each in outer for name in schemas if f'/{name}"' in json.dumps(schemas[each])}
+    elsewhere |= {name: "openapi.json" for name in schemas if name not in outer | inner | set(elsewhere)}
     sections += [
-        format_model(name, schema, configured, name not in outer)
+        format_model(name, schema, elsewhere, name not in outer)
         for name, schema in sorted(schemas.items())
-        if name not in configured
+        if name not in elsewhere
     ]
     return "\n".join(sections)
 
@@ -142,15 +145,15 @@ def format_content(response):
     return format_type(content["schema"]) if "$ref" in content["schema"] else media_type
 
 
-def format_model(name, schema, configured, is_inner):
-    """Format one model: its description and members. The page on the configuration has those of `configured`.
+def format_model(name, schema, elsewhere, is_inner):
+    """Format one model: its description and members. Other pages have those of `elsewhere`.
 
     is_inner: whether it is part of other models only, so that the page says less of its members
     """
     lines = [f"### {name}", ""]
     inherited = list_configured_members(name)
     members = {
-        member: format_type(item, configured)
+        member: format_type(item, elsewhere)
         for member, item in schema.get("properties", {}).items()
         if member not in inherited or "Effective" in str(item)
     }
@@ -228,13 +231,13 @@ def format_parameter(item):
     return f"- `{item['name']}` {kind}{default}: {item.get('description', '')}"
 
 
-def format_type(schema, configured=frozenset()):
+def format_type(schema, elsewhere=MappingProxyType({})):
     """Format the type of a schema. A model is linked."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
-        return f"[{name}](configuration.md)" if name in configured else f"[{name}](#{name.lower()})"
+        return f"[{name}]({elsewhere.get(name, f'#{name.lower()}')})"
     if "anyOf" in schema:
-        kinds = [format_type(item, configured) for item in schema["anyOf"] if item.get("type") != "null"]
+        kinds = [format_type(item, elsewhere) for item in schema["anyOf"] if item.get("type") != "null"]
         text = " or ".join(kinds)
         return f"({text})" if len(kinds) < len(schema["anyOf"]) else text
     if "enum" in schema or "const" in schema:
@@ -242,10 +245,10 @@ def format_type(schema, configured=frozenset()):
     if schema.get("type") == "array":
         if "prefixItems" in schema:
             return f"[{', '.join(format_type(item) for item in schema['prefixItems'])}]"
-        kind = format_type(schema["items"])
+        kind = format_type(schema["items"], elsewhere)
         return f"{kind}[]" if " " not in kind else f"list of {kind}"
     if schema.get("type") == "object" and isinstance(schema.get("additionalProperties"), dict):
-        return f"map of {format_type(schema['additionalProperties'])}"
+        return f"map of {format_type(schema['additionalProperties'], elsewhere)}"
     return schema.get("type", "any")
 
 
