@@ -58,6 +58,9 @@ class StandingRig(PlannerRig):
             return plan
 
         monkeypatch.setattr(planner, "make_plan", make_plan_in_time)
+        # Priorities mean nothing in virtual time, and each change costs as much as a plan.
+        monkeypatch.setattr(planner, "set_realtime_priority", lambda priority: None)
+        monkeypatch.setattr(planner, "use_usual_priority", lambda: None)
 
     def pass_time(self, duration_s):
         """Let the link process and the loop run while the planner computes."""

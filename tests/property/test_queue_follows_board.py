@@ -292,7 +292,11 @@ TRIMMED_TO_NOTHING = 2449
 """A plan of pulses trimmed to nothing is followed by another."""
 
 
-@pytest.mark.parametrize("seed", [*range(4), 2000, TRIMMED_TO_NOTHING, *CANCELLED_BEFORE_ANOTHER])
+DELAYED_AT_ITS_START = 9990
+"""A plan that waits starts later than it was planned for."""
+
+
+@pytest.mark.parametrize("seed", [*range(4), 2000, TRIMMED_TO_NOTHING, *CANCELLED_BEFORE_ANOTHER, DELAYED_AT_ITS_START])
 def test_the_queue_follows_the_board(monkeypatch, seed):
     judge(Scene(monkeypatch, seed).run())
 

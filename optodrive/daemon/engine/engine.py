@@ -19,10 +19,10 @@ from optodrive.core.processes import use_usual_priority
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan, PlanStore
 from optodrive.daemon.engine.kept_heat import KeptHeat
-from optodrive.daemon.engine.metrics import ClockShift, PlanCounters, PlanProgress, render_metrics
+from optodrive.daemon.engine.metrics import ClockShift, PlanCounters, PlanProgress, build_queue_report, render_metrics
 from optodrive.daemon.engine.page_refresh import PageRefresh
 from optodrive.daemon.engine.plan_making import NEVER, Dimmer, PlanningRequest
-from optodrive.daemon.engine.plan_queue import PlanQueue, build_queue_report
+from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_rest import ThermalMemory
 from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.message_loop import LoopCommands, MessageLoop
@@ -330,11 +330,10 @@ class Engine:
 
     def build_planner_state(self) -> PlannerState:
         """Report queue and planner."""
-        accounts = self._plan_queue.accounts
+        queue, accounts = self._plan_queue, self._plan_queue.accounts
+        recent, clocks_s = self._plan_store.list_recent(), (self.board_s(), self._clock.now_s())
         return PlannerState(
-            queue=build_queue_report(
-                self._plan_queue, self._plan_store.list_recent(), self.board_s(), self._clock.now_s()
-            ),
+            queue=build_queue_report(queue.state, queue.pause_ends_in_s, recent, *clocks_s),
             totals=PulseTotals(
                 **accounts.totals,
                 timing_error=accounts.timing.worst,

@@ -1,7 +1,7 @@
 """Counts of pulses and plans, and the metrics of GET /metrics in the Prometheus text format, version 0.0.4.
 
 `PulseAccounts` says how many pulses were planned, sent and executed, when, and with which error; events on the progress
-of running plans go to one reader in another thread.
+of running plans go to one reader in another thread. `build_queue_report` lists the plans for the state.
 """
 
 from collections import Counter, deque
@@ -12,9 +12,9 @@ from optodrive import __version__
 from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.engine.queue_state import PlanRun
+from optodrive.daemon.engine.queue_state import PlanRun, QueueState
 from optodrive.daemon.responses.plan import ENDS, PlanStatus
-from optodrive.daemon.responses.state import PlannerState
+from optodrive.daemon.responses.state import PlannerState, QueuedPlan, QueueReport, RecentPlan
 from optodrive.device.config import Config
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.remote_session import RemoteSession
@@ -240,3 +240,34 @@ def _ms_to_s(milliseconds: float | None) -> float | None:
 
 def _escape_label(text: str) -> str:
     return text.replace("\\", "\\\\").replace("\n", "\\n").replace('"', '\\"')
+
+
+def build_queue_report(
+    state: QueueState, pause_ends_in_s: float | None, recent: list[PlanRecord], board_now_s: float, host_now_s: float
+) -> QueueReport:
+    """Report the running and waiting plans with their progress at a board and host time, s, and the recent ones."""
+    running = [run.plan.record for run in state.running]
+    waiting = [plan.record for plan in state.waiting]
+    if waiting and waiting[0].status == PlanStatus.PAUSED:
+        running.append(waiting.pop(0))
+    times_at_s = board_now_s if state.off_s is None else state.off_s  # as if the queue went on now
+    return QueueReport(
+        waiting=len(waiting),
+        running=running[0].plan_id if running else None,
+        paused=pause_ends_in_s is not None,
+        pause_ends_in_s=pause_ends_in_s,
+        active=[_build_queued(record, times_at_s, host_now_s) for record in (*running, *waiting)],
+        plans=[RecentPlan.from_object(record, **_name_counts(record, host_now_s)) for record in recent],
+    )
+
+
+def _name_counts(record: PlanRecord, host_now_s: float) -> dict[str, Any]:
+    age_s = max(0.0, host_now_s - record.arrived_host_s)
+    return {"plan": record.plan_id, "age_s": age_s, "planned": record.pulse_count, "executed": record.executed_count}
+
+
+def _build_queued(record: PlanRecord, board_now_s: float, host_now_s: float) -> QueuedPlan:
+    starts_in_s = record.start_s + record.delay_s - board_now_s
+    ends_in_s = None if record.status == PlanStatus.PAUSED else max(0.0, starts_in_s + record.duration_s)
+    counts = _name_counts(record, host_now_s)
+    return QueuedPlan.from_object(record, **counts, starts_in_s=starts_in_s, ends_in_s=ends_in_s)

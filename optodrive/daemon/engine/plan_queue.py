@@ -20,7 +20,6 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 from math import inf
-from typing import Any
 
 from optodrive.core.errors import NotReadyError, StoppedError
 from optodrive.daemon.engine.active_plan import ActivePlan, PlanStore, ThermalEstimate, simulate_plan
@@ -36,7 +35,6 @@ from optodrive.daemon.engine.plan_rest import (
 )
 from optodrive.daemon.engine.queue_state import LightEnd, PlanEnd, PlanRun, QueueState
 from optodrive.daemon.responses.plan import PlanStatus
-from optodrive.daemon.responses.state import QueuedPlan, QueueReport, RecentPlan
 from optodrive.link.protocol.stage_points import PointCut
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.control import BEAT_AGE_MAX_S, DISARM, STOP
@@ -504,36 +502,3 @@ class PlanQueue:
     def know(self, estimate: ThermalEstimate) -> None:
         """Continue from another estimate, as of an earlier planner or daemon."""
         self._apply(self.state.know(estimate))
-
-
-def build_queue_report(
-    plan_queue: PlanQueue, recent: list[PlanRecord], board_now_s: float, host_now_s: float
-) -> QueueReport:
-    """Report the running and waiting plans with their progress at a board and host time, s, and the recent ones."""
-    state = plan_queue.state
-    running = [run.plan.record for run in state.running]
-    waiting = [plan.record for plan in state.waiting]
-    if waiting and waiting[0].status == PlanStatus.PAUSED:
-        running.append(waiting.pop(0))
-    pause_ends_in_s = plan_queue.pause_ends_in_s
-    times_at_s = board_now_s if state.off_s is None else state.off_s  # as if the queue went on now
-    return QueueReport(
-        waiting=len(waiting),
-        running=running[0].plan_id if running else None,
-        paused=pause_ends_in_s is not None,
-        pause_ends_in_s=pause_ends_in_s,
-        active=[_build_queued(record, times_at_s, host_now_s) for record in (*running, *waiting)],
-        plans=[RecentPlan.from_object(record, **_name_counts(record, host_now_s)) for record in recent],
-    )
-
-
-def _name_counts(record: PlanRecord, host_now_s: float) -> dict[str, Any]:
-    age_s = max(0.0, host_now_s - record.arrived_host_s)
-    return {"plan": record.plan_id, "age_s": age_s, "planned": record.pulse_count, "executed": record.executed_count}
-
-
-def _build_queued(record: PlanRecord, board_now_s: float, host_now_s: float) -> QueuedPlan:
-    starts_in_s = record.start_s + record.delay_s - board_now_s
-    ends_in_s = None if record.status == PlanStatus.PAUSED else max(0.0, starts_in_s + record.duration_s)
-    counts = _name_counts(record, host_now_s)
-    return QueuedPlan.from_object(record, **counts, starts_in_s=starts_in_s, ends_in_s=ends_in_s)
