@@ -130,6 +130,22 @@ def test_an_option_of_simulated_participants_is_refused_beside_a_person(tmp_path
     assert says in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("study", "arguments", "says"),
+    [
+        ("temporal-order", [], "--session: missing, expected 1 to 2"),
+        ("temporal-order", ["--session", "3"], "--session: got 3, expected 1 to 2"),
+        ("detection", ["--session", "1"], "--session: got 1, expected none: the study has one session"),
+        ("height-threshold", [], "--participant: got 'ab', expected a code with a number"),
+    ],
+)
+def test_a_session_that_the_study_has_not_is_refused(tmp_path, capsys, study, arguments, says):
+    code = "ab" if study == "height-threshold" else "07"
+    assert run(["study", study, "--out", str(tmp_path / "data"), "--participant", code, *arguments]) == 2
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+
+
 @pytest.mark.parametrize(("option", "value"), [("--page", "0"), ("--lsl", None), ("--hold", None)])
 def test_an_option_of_a_person_is_refused_for_a_simulated_participant(tmp_path, capsys, option, value):
     given = [option] if value is None else [option, value]
@@ -149,6 +165,9 @@ def test_an_identifier_in_other_letters_is_refused(tmp_path):
     check_new_participant("--participant", tmp_path, "p2")
     with pytest.raises(InputError, match="--participant: got 'P1', expected p1, as the dataset spells it"):
         check_new_participant("--participant", tmp_path, "P1")
+    (tmp_path / "participants.tsv").write_text("participant_id\tage\nsub-q7\t30\n")  # a row of the laboratory's
+    with pytest.raises(InputError, match="--participant: got 'Q7', expected q7, as the dataset spells it"):
+        check_new_participant("--participant", tmp_path, "Q7")
 
 
 def test_the_study_of_the_documentation_can_be_rehearsed(tmp_path, capsys):
