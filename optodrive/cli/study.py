@@ -1,4 +1,4 @@
-"""`optodrive study run | report`: run a study with people or simulated participants, and judge its dataset.
+"""`optodrive study run | power | report`: plan, run and judge a study with people or simulated participants.
 
 `optodrive study STUDY` is short for `optodrive study run STUDY`.
 """
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from optodrive.study.trial_log import TrialLog
 
 PARTICIPANTS_MAX = 1000
+SEEDS_MAX, SIMULATED_TRIALS = 100_000, 150_000
+POWER_SOUGHT = 0.8
+"""Power that is customarily sought."""
 STUDY_HELP = (
     "A study file, or a shipped one: apparent-motion, detection, equal-intensity, equalisation, experiment-1 to "
     "experiment-6, frequency-discrimination, gap-detection, height-threshold, pattern-identification, reading-speed, "
@@ -134,6 +137,106 @@ def run(
     if design.matching is not None and display_config is not None:
         report["sensitivity"] = _write_sensitivity(design, design.matching, sessions, out, display_config)
     print_answer(report, _format_report(report), json)
+
+
+@GROUP.command()
+def power(
+    source: Annotated[str, typer.Argument(metavar="STUDY", help=STUDY_HELP)],
+    participants: Annotated[
+        str, typer.Option("--participants", metavar="N|N..M", help="Numbers of participants of the study.")
+    ] = "4..40",
+    compare: Annotated[
+        str | None,
+        typer.Option("--compare", metavar="FACTOR", help="Compare the last and the first value of a factor."),
+    ] = None,
+    reference: Annotated[
+        float | None,
+        typer.Option(
+            "--reference",
+            metavar="VALUE",
+            help="What the interval is to exclude: a share (the chance level by default), a threshold, a difference.",
+        ),
+    ] = None,
+    spread: Annotated[
+        float,
+        typer.Option(
+            "--spread", metavar="SD", help="How participants differ: standard deviation of the logarithm of acuity."
+        ),
+    ] = 0.0,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            "--seeds",
+            metavar="K",
+            help="Number of simulated participants: by default 500 to 5000, 300 with a procedure.",
+        ),
+    ] = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Estimate from simulated participants how often a study with a number of participants shows its effect.
+
+    The power is the share of studies whose 95 % interval excludes the reference.
+    """
+    from optodrive.device.config_file import load_config
+    from optodrive.planning.display_model import DisplayModel
+    from optodrive.study.power import compute_powers, measure_effect, simulate_sessions
+    from optodrive.study.study_file import load_study
+    from optodrive.study.trial_stimulus import check_stimuli
+
+    design, numbers = load_study(source), _parse_numbers(participants)
+    if design.matching is not None:
+        raise InputError("study", source, "a study with correct answers, a procedure or factors, not a matching")
+    per_person = design.trial_count * design.sessions
+    usual = 300 if design.procedure is not None else min(max(SIMULATED_TRIALS // per_person, 500), 5000)
+    count = usual if seeds is None else seeds
+    if not 10 <= count <= SEEDS_MAX:
+        raise InputError("--seeds", count, f"10 to {SEEDS_MAX}")
+    if not 0.0 <= spread <= 3.0:
+        raise InputError("--spread", spread, "0 to 3")
+    display_config = load_config(config)
+    check_stimuli(design, display_config)
+    measure_effect(design, [], compare, reference, spread)  # refuses what the design has not, before it simulates
+    announce_compilation()
+    with show_progress("simulating") as on_progress:
+        people = simulate_sessions(design, DisplayModel.from_config(display_config), count, spread, on_progress)
+    effect = measure_effect(design, people, compare, reference, spread)
+    powers = list(compute_powers(effect, numbers, design.seed))
+    enough = next((one.participants for one in powers if one.power >= POWER_SOUGHT), None)
+    report: dict[str, Any] = {
+        "study": design.name,
+        "effect": effect.name,
+        "reference": effect.reference,
+        "mean": effect.mean,
+        "test": effect.test,
+        "simulated_participants": count,
+        "spread": spread,
+        "enough_participants": enough,
+        "powers": [one._asdict() for one in powers],
+    }
+    print_answer(report, _format_powers(report), json)
+
+
+def _parse_numbers(text: str) -> range:
+    """Return the numbers of a range such as 4..40. Raise InputError."""
+    low, _, high = text.partition("..")
+    numbers = [int(each) for each in (low, high or low) if each.isascii() and each.isdigit()]
+    if len(numbers) != 2 or not 2 <= numbers[0] <= numbers[1] <= PARTICIPANTS_MAX:
+        raise InputError("--participants", text, f"a number from 2 to {PARTICIPANTS_MAX}, or two such as 4..40")
+    return range(numbers[0], numbers[1] + 1)
+
+
+def _format_powers(report: dict[str, Any]) -> Iterator[str]:
+    yield f"study            {report['study']}"
+    yield f"effect           {report['effect']}: {report['mean']:.4g}, reference {report['reference']:.4g}"
+    yield f"test             {report['test']}"
+    alike = "all alike; --spread states how they differ" if report["spread"] == 0.0 else f"spread {report['spread']:g}"
+    yield f"simulated        {report['simulated_participants']} participants, {alike}"
+    for one in report["powers"]:
+        shown = f"power {one['power']:.3f} (95 % interval {one['low']:.3f} to {one['high']:.3f})"
+        yield f"{one['participants']:<17}{shown}, effect {one['effect_low']:.4g} to {one['effect_high']:.4g}"
+    enough = report["enough_participants"]
+    yield f"enough           {'none of these' if enough is None else enough} for a power of {POWER_SOUGHT:g}"
 
 
 @GROUP.command()

@@ -87,7 +87,10 @@ SCENARIOS = {
     ),
     "discovery": (write_motor, ["docs/how-to/discover-a-term.md:Find what a simulation lacks"]),
     "discovery-in-a-pixel": (write_slack, ["docs/how-to/discover-a-term.md:In a pixel"]),
-    "analysis": (write_checkout, ["docs/how-to/analyse-a-study.md:The report"]),
+    "analysis": (
+        write_checkout,
+        ["docs/how-to/analyse-a-study.md:Power, before the study", "docs/how-to/analyse-a-study.md:The report"],
+    ),
     "film": (write_film, ["docs/explanation/diagnosis.md:Whole displays"]),
     "recordings": (write_recordings, ["docs/reference/recordings.md:Recordings"]),
     "recordings-python": (write_film, ["docs/reference/recordings.md:From Python"]),
