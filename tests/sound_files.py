@@ -1,6 +1,7 @@
 """Random sound files of every format, and the same with one quantity in a wrong unit."""
 
 import json
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -85,15 +86,19 @@ def write_toml(path, table):
 
     def add(prefix, values):
         scalars = {key: value for key, value in values.items() if not isinstance(value, dict)}
-        lines.extend(f"{key} = {format_toml(value)}" for key, value in scalars.items())
+        lines.extend(f"{format_key(key)} = {format_toml(value)}" for key, value in scalars.items())
         for key, value in values.items():
             if isinstance(value, dict):
-                lines.append(f"[{prefix}{key}]")
-                add(f"{prefix}{key}.", value)
+                lines.append(f"[{prefix}{format_key(key)}]")
+                add(f"{prefix}{format_key(key)}.", value)
 
     add("", table)
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def format_key(key):
+    return key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key)
 
 
 def format_toml(value):
@@ -104,7 +109,7 @@ def format_toml(value):
     if isinstance(value, list | tuple):
         return f"[{', '.join(format_toml(item) for item in value)}]"
     if isinstance(value, dict):
-        return f"{{ {', '.join(f'{key} = {format_toml(item)}' for key, item in value.items())} }}"
+        return f"{{ {', '.join(f'{format_key(key)} = {format_toml(item)}' for key, item in value.items())} }}"
     return repr(value)
 
 
