@@ -261,7 +261,7 @@ class Term:
                 f"{self.key} of {describe_signals(acting)}",
                 tuple(dict.fromkeys(names, 0.0) | dict.fromkeys(acting, start) for start in self.starts_by_signal),
                 (self.free(*acting),),
-                is_linear=True,
+                self.is_linear,
             )
             for acting in scope.list_signal_sets(names)
         ]

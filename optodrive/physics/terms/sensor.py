@@ -30,6 +30,8 @@ from optodrive.physics.term import (
     build_signal_parameters,
 )
 
+SIGNALS = BySignal._fields[:3]
+"""Signals of a pixel."""
 SETTLED, MAX_ORDER = 20.0, 4.0
 """Time constants after which a filter has settled; largest order of a filter."""
 
@@ -221,6 +223,7 @@ class ClockOffset(Term):
     label = "an instrument's clock is offset"
     parameters = build_signal_parameters("s", 1e-4, -5e-3, 5e-3, "0.05 to 3 ms in either direction")
     starts_by_signal = (2e-4,)
+    is_linear = True
     cannot_add_heat = True
     is_exact = True
     subsystems = ("pixels", "mirrors")
@@ -239,6 +242,7 @@ class TimeRate(Term):
     label = "an instrument's time axis has a wrong rate"
     parameters = build_signal_parameters("1", 2e-3, -0.05, 0.05, "nominal sampling rates, within 2 %")
     starts_by_signal = (2e-3, 1e-2, -1e-2)  # edges late in a train move by more than their width at the large ones
+    is_linear = True
     cannot_add_heat = True
     is_exact = True
     subsystems = ("pixels", "mirrors")
@@ -250,18 +254,15 @@ class TimeRate(Term):
         return BySignal(**values)
 
 
-HIGH_PASS_SIGNALS = BySignal._fields[:3]
-HIGH_PASS_STARTS_HZ = (0.03, 0.3, 3.0)
-
-
 class HighPass(Term):
     """dy/dt = dx/dt − 2π · cut-off frequency · y, with x the signal and y its record."""
 
     key = "high_pass"
     label = "an instrument's input is AC coupled"
     parameters = build_signal_parameters(
-        "Hz", 0.3, 0.0, 30.0, "AC inputs of oscilloscopes and amplifiers, 0.1 to 10 Hz", HIGH_PASS_SIGNALS
+        "Hz", 0.3, 0.0, 30.0, "AC inputs of oscilloscopes and amplifiers, 0.1 to 10 Hz", SIGNALS
     )
+    starts_by_signal = (0.03, 0.3, 3.0)
     cannot_add_heat = True
     only_records = True
     signature = "a signal that falls while the drive is held, and undershoots after it"
@@ -276,22 +277,7 @@ class HighPass(Term):
         cutoff_hz = values.get(signal, 0.0)
         return value if cutoff_hz <= 0.0 else value - low_pass(t_s, value, 1.0 / (2.0 * pi * cutoff_hz))
 
-    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
-        """Return one cut-off frequency of each signal, and one of all signals where there are several."""
-        return [
-            Hypothesis(
-                self.key,
-                f"{self.key} of {describe_signals(names)}",
-                tuple(
-                    dict.fromkeys(HIGH_PASS_SIGNALS, 0.0) | dict.fromkeys(names, start) for start in HIGH_PASS_STARTS_HZ
-                ),
-                (self.free(*names),),
-            )
-            for names in scope.list_signal_sets(HIGH_PASS_SIGNALS)
-        ]
 
-
-SIGNALS = BySignal._fields
 SMOOTHING_STARTS_S = (1e-3, 5e-3, 2e-2)
 SMOOTHING_FORMS = (
     *((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (3.0, 0.0, 0.0)),
@@ -312,7 +298,7 @@ class Smoothing(Term):
     key = "smoothing"
     label = "a signal was smoothed before it was recorded"
     parameters = (
-        *build_signal_parameters("s", 5e-3, 0.0, 0.1, "moving means and filters of loggers, to 50 ms", SIGNALS[:3]),
+        *build_signal_parameters("s", 5e-3, 0.0, 0.1, "moving means and filters of loggers, to 50 ms", SIGNALS),
         TermParameter(
             "order", "1", 0.0, 0.0, MAX_ORDER, "0 moving mean, from 1 on filter run both ways", (0.0, 1.0), True
         ),
@@ -352,7 +338,7 @@ class Smoothing(Term):
                 self.key,
                 f"{self.key} of {describe_signals(names)}",
                 tuple(
-                    dict.fromkeys(SIGNALS[:3], 0.0) | dict.fromkeys(names, width_s) | form
+                    dict.fromkeys(SIGNALS, 0.0) | dict.fromkeys(names, width_s) | form
                     for width_s in SMOOTHING_STARTS_S
                     for form in (
                         dict(zip(("order", "late", "by_samples"), numbers, strict=True)) for numbers in SMOOTHING_FORMS
@@ -360,7 +346,7 @@ class Smoothing(Term):
                 ),
                 (self.free(*names), self.free("order"), self.free("late")),
             )
-            for names in scope.list_signal_sets(SIGNALS[:3])
+            for names in scope.list_signal_sets(SIGNALS)
         ]
 
 
@@ -380,9 +366,7 @@ class RunGain(Term):
     key = "run_gain"
     label = "the gain of an instrument, or the power of the laser, is another in some runs"
     parameters = (
-        *build_signal_parameters(
-            "1", GAIN_START, -0.5, 0.5, "a range, a lens or a sensor exchanged, to 30 %", SIGNALS[:3]
-        ),
+        *build_signal_parameters("1", GAIN_START, -0.5, 0.5, "a range, a lens or a sensor exchanged, to 30 %", SIGNALS),
         TermParameter(
             "first", "1", -1.0, -1.0 - BESIDE_RUN, 1.0 + BESIDE_RUN, "session time of the first run", (), True
         ),
@@ -414,9 +398,9 @@ class RunGain(Term):
         From a run on, all signals together change as the absorber does that loses some of its absorption. Where the
         powers are few, the gains of one signal may follow them by chance.
         """
-        none = dict.fromkeys(SIGNALS[:3], 0.0) | {item.name: item.default for item in self.parameters[3:]}
+        none = dict.fromkeys(SIGNALS, 0.0) | {item.name: item.default for item in self.parameters[3:]}
         hypotheses = []
-        for names in scope.list_signal_sets(SIGNALS[:3]):
+        for names in scope.list_signal_sets(SIGNALS):
             is_alone = len(names) == 1 or len(scope.signals) == 1
             spans = scope.list_run_spans(with_steps=is_alone)
             start, label = none | dict.fromkeys(names, GAIN_START), f"{self.key} of {describe_signals(names)}"
