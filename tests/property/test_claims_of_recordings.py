@@ -26,8 +26,8 @@ from optodrive.lab.recording import read_recording
 FAULTS_MAX, GROUPS_MAX, REPEATS_MAX = 4, 5, 3
 SHORT_SHARE = 0.75
 """Share of the recordings that keep a few single pulses alone, which are diagnosed in a third of the time."""
-PIECES, PIECE = 20, 50
-"""Pieces of 1,000 recordings: one takes 5 minutes of processor time."""
+PIECES, PIECE = 40, 25
+"""Pieces of 1,000 recordings: one takes some 12 minutes of processor time, 30 s for a recording."""
 NAMED, NOTHING = 1, 4
 """Clean recordings with a cause that is named, and without one."""
 OUTLIER_SIGMA, SAMPLES_PER_OUTLIER, INTERVAL_CHANGE_MAX = 25.0, 10_000, 0.05
