@@ -21,6 +21,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, SIGNALS
 from optodrive.lab.diagnosis.noise_model import estimate_resolution
+from optodrive.lab.inspection.response_faults import compute_template, thin
 from optodrive.physics.pixel import Pixel
 
 MAX_MAGNITUDE = 1e9
@@ -38,7 +39,6 @@ MIN_SAMPLES, MAX_INTERVAL_S = 20, 2e-3
 """Minimum number of samples of a signal whose noise is estimated; their maximum interval, shorter than a response."""
 MIRROR_SIGNALS = tuple(SIGNALS[kind] for kind in MIRROR_KINDS)
 UNITS = {name: name.rpartition("_")[2] for name in SIGNALS}
-PLAUSIBLE = RECORDING
 WEAK_POWER_W = 5.0
 """Powers that respond a hundred times too weakly are taken for mW above this value."""
 LENGTHS = ("bridge_width_m", "aim_x_m", "aim_y_m")
@@ -63,7 +63,6 @@ MOVEMENT_AGREES = 0.5
 """Share of a mirror's variance that its commands explain for a match; a slow servo follows steps badly."""
 CLOCK_OFFSETS_S = np.linspace(-5e-3, 5e-3, 21)
 """Offsets of an instrument's clock that are tried before another unit is: they are a cause that a diagnosis names."""
-SAMPLES_MAX, PULSES_MAX = 300, 100
 RESISTANCE_FACTORS = (0.5, 1.0, 2.0)
 """Thermal resistances tried, relative to the reference pixel's."""
 
@@ -173,9 +172,9 @@ def check_recording_units(measurement: Measurement, pixel: Pixel, place: str = "
             length = run.attributes.get(name)
             if isinstance(length, int | float):
                 # Lengths first: they are stated, and no response is needed to judge them.
-                check_plausible(f"{where}: {name}", float(length), PLAUSIBLE[name])
+                check_plausible(f"{where}: {name}", float(length), RECORDING[name])
         if len(run.pulses):
-            check_plausible(f"{where}/pulses: power_W", float(run.pulses[:, 2].max()), PLAUSIBLE["pulses.power_W"])
+            check_plausible(f"{where}/pulses: power_W", float(run.pulses[:, 2].max()), RECORDING["pulses.power_W"])
         ratios: list[float] = []
         for name, signal in run.signals.items():
             finite = np.isfinite(signal.value)
@@ -201,7 +200,7 @@ def _check_pixel_signal(
     own = run.pulses[run.pulses[:, 3] == measured_pixel]
     ratio = None
     if len(value) >= MIN_SHAPE_SAMPLES and float((own[:, 1] * own[:, 2]).sum()) > 0.0:
-        pulses, times_s, values = _thin(own, t_s, value)
+        pulses, times_s, values = thin(own, t_s, value)
         stated, ratio = _compare(name, pixel, pulses, times_s, values)
         likely = _find_time_units(name, pixel, pulses, times_s, values, stated)
         if likely is not None:
@@ -215,8 +214,8 @@ def _check_pixel_signal(
     if name in CHANGE_SIGNALS:
         median = float(np.median(value))
         change = max(float(value.max()) - median, median - float(value.min()))
-        if change > PLAUSIBLE[name].high + NOISE_SIGMAS * _estimate_noise(value):
-            check_plausible(f"{where}/{name}", change, PLAUSIBLE[name])
+        if change > RECORDING[name].high + NOISE_SIGMAS * _estimate_noise(value):
+            check_plausible(f"{where}/{name}", change, RECORDING[name])
     return ratio
 
 
@@ -243,14 +242,14 @@ def _check_temperature(where: str, run: Run, t_s: FloatArray, value: FloatArray)
     first_s = float(run.pulses[:, 0].min()) if len(run.pulses) else np.inf
     before = value[t_s < first_s]
     baseline = float(np.median(before)) if len(before) >= 5 else float(np.quantile(value, 0.02))
-    if float(np.median(value)) > PLAUSIBLE["absorber_temperature_K"].high:
+    if float(np.median(value)) > RECORDING["absorber_temperature_K"].high:
         _refuse(where, f"{baseline:.6g} in the dark", "K", "mK")
     if baseline > run.ambient_k - AMBIENT_TOLERANCE_K:
         coldest, hottest, noise = float(value.min()), float(value.max()), NOISE_SIGMAS * _estimate_noise(value)
-        if coldest < -noise or hottest > PLAUSIBLE["absorber_temperature_K"].high + noise:
+        if coldest < -noise or hottest > RECORDING["absorber_temperature_K"].high + noise:
             worst = coldest if coldest < -noise else hottest
             raise InputError(
-                where, worst, f"temperatures above 0 K, up to {PLAUSIBLE['absorber_temperature_K'].high:g} K"
+                where, worst, f"temperatures above 0 K, up to {RECORDING['absorber_temperature_K'].high:g} K"
             )
         return
     ambient_c = run.ambient_k - ZERO_CELSIUS_K
@@ -268,8 +267,8 @@ def _check_mirror(where: str, run: Run, name: str, t_s: FloatArray, value: Float
     angle = ("x_rad", "y_rad")[column - 1]
     commanded = f"commands: {angle}"
     interval_s = float(np.median(np.diff(run.signals[name].t_s)))
-    check_plausible(f"{where}/{commanded}", float(np.abs(command).max()), PLAUSIBLE[f"commands.{angle}"])
-    check_plausible(f"{where}/{name}", float(np.abs(value).max()), PLAUSIBLE[name])
+    check_plausible(f"{where}/{commanded}", float(np.abs(command).max()), RECORDING[f"commands.{angle}"])
+    check_plausible(f"{where}/{name}", float(np.abs(value).max()), RECORDING[name])
     stated, ratio = _explain(value, _hold(command_s, command, t_s))
     trials = [
         (_explain(value, _hold(command_s * commands, command, t_s * samples))[0], quantity, unit)
@@ -309,18 +308,6 @@ def _refuse_size(where: str, observed: str, ratio: float, unit: str) -> NoReturn
     _refuse(where, observed, unit, ("m", "µ", "n")[step - 1] + unit)
 
 
-def _thin(pulses: FloatArray, t_s: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the first pulses and some of the samples before the next one, or of all if there are hardly any."""
-    pulses = pulses[np.argsort(pulses[:, 0], kind="stable")]
-    if len(pulses) > PULSES_MAX:
-        early = t_s < pulses[PULSES_MAX, 0]
-        if early.sum() >= 50:
-            t_s, value = t_s[early], value[early]
-        pulses = pulses[:PULSES_MAX]
-    stride = max(1, len(t_s) // SAMPLES_MAX)
-    return pulses, t_s[::stride], value[::stride]
-
-
 def _compare_in(
     unit: _TimeUnits, name: str, pixel: Pixel, pulses: FloatArray, t_s: FloatArray, value: FloatArray
 ) -> float:
@@ -336,19 +323,12 @@ def _compare(name: str, pixel: Pixel, pulses: FloatArray, t_s: FloatArray, value
 def _compute_response(name: str, pixel: Pixel, factor: float, pulses: FloatArray, t_s: FloatArray) -> FloatArray:
     """Return the linear response of a pixel with another bridge resistance, in the signal's unit."""
     r_k_per_w = factor * pixel.r_k_per_w
-    tau_s, gas_s = r_k_per_w * pixel.c_j_per_k, pixel.tau_g_s
-    if abs(tau_s - gas_s) < 1e-2 * tau_s:
-        gas_s = 0.98 * tau_s
-    since_start = np.maximum(t_s[:, None] - pulses[:, 0], 0.0)
-    since_end = np.maximum(t_s[:, None] - (pulses[:, 0] + pulses[:, 1]), 0.0)
-    slow, fast = (np.exp(-since_end / tau) - np.exp(-since_start / tau) for tau in (tau_s, gas_s))
-    scale = {
-        "absorber_temperature_K": 1.0,
-        "displacement_m": 0.5 * pixel.kappa_m_per_k,
-        "force_N": 0.5 * pixel.phi_n_per_k,
+    scale, gas_s = {
+        "absorber_temperature_K": (1.0, 0.0),
+        "displacement_m": (0.5 * pixel.kappa_m_per_k, pixel.tau_g_s),
+        "force_N": (0.5 * pixel.phi_n_per_k, pixel.tau_g_s),
     }[name]
-    shape = slow if name == "absorber_temperature_K" else (tau_s * slow - gas_s * fast) / (tau_s - gas_s)
-    return np.asarray(scale * r_k_per_w * pixel.epsilon * (shape @ pulses[:, 2]))
+    return scale * r_k_per_w * pixel.epsilon * compute_template(pulses, t_s, r_k_per_w * pixel.c_j_per_k, gas_s)
 
 
 def _hold(command_s: FloatArray, command: FloatArray, t_s: FloatArray) -> FloatArray:

@@ -127,14 +127,19 @@ def _select_responding(work: Work, name: str) -> list[Member]:
         own = pulses[(pulses[:, 3] == signal.pixel) & (pulses[:, 1] * pulses[:, 2] > 0.0)]
         if name.startswith("mirror") or not len(own) or len(value) < MIN_SAMPLES:
             continue
-        own = own[np.argsort(own[:, 0])]
-        if len(own) > PULSES_MAX:
-            is_early = t_s < own[PULSES_MAX, 0]
-            if is_early.sum() >= MIN_SAMPLES:
-                t_s, value, own = t_s[is_early], value[is_early], own[:PULSES_MAX]
-        stride = max(1, len(t_s) // SAMPLES_MAX)
-        out.append((number, signal, own, t_s[::stride], value[::stride]))
+        out.append((number, signal, *thin(own, t_s, value)))
     return out
+
+
+def thin(pulses: FloatArray, t_s: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the first pulses and some of the samples before the next one, or of all if there are hardly any."""
+    pulses = pulses[np.argsort(pulses[:, 0], kind="stable")]
+    if len(pulses) > PULSES_MAX:
+        is_early = t_s < pulses[PULSES_MAX, 0]
+        if is_early.sum() >= MIN_SAMPLES:
+            t_s, value, pulses = t_s[is_early], value[is_early], pulses[:PULSES_MAX]
+    stride = max(1, len(t_s) // SAMPLES_MAX)
+    return pulses, t_s[::stride], value[::stride]
 
 
 def _fit(template: FloatArray, value: FloatArray) -> tuple[float, float, float]:
