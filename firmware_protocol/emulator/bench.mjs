@@ -57,6 +57,7 @@ const commands = {
     chip.tickMax = chip.gapMax = 0;
   },
   head(answer) { Object.assign(head, answer); },
+  everyFrame() { setup.everyFrame = chip.xy2.everyFrame = true; },
   frames() { emit("frames", chip.xy2.decoder.frames, chip.xy2.decoder.errors); },
   stack() { emit("stack", ...chip.measureStack()); },
   trace(on) {

@@ -23,26 +23,17 @@ def image(tmp_path_factory):
     return PicoImage(tmp_path_factory.mktemp("xy2-100"))
 
 
-class ThoroughPico(EmulatedDigitalPico):
-    """A Pico every frame of which is played."""
-
-    plays_every_frame = True
-
-
-@pytest.fixture(params=[EmulatedDigitalPico])
-def bench(image, tmp_path, request):
-    bench = Bench(VirtualKind("xy2-100", partial(request.param, image), make_board=PicoBoard), tmp_path)
+@pytest.fixture
+def bench(image, tmp_path):
+    bench = Bench(VirtualKind("xy2-100", partial(EmulatedDigitalPico, image), make_board=PicoBoard), tmp_path)
     yield bench
     bench.finish(lambda board: None)
 
 
-every_frame = pytest.mark.parametrize("bench", [ThoroughPico], ids=["every frame"], indirect=True)
-
-
-def draw_points(count, seed):
+def draw_points(count, seed, dark_us=200):
     """Return points at random places, each with a short pulse."""
     places = np.random.default_rng(seed).integers(0, 65536, (count, 2)).tolist()
-    return [here(100, x=x, y=y, dark_us=200, duty=999) for x, y in places]
+    return [here(100, x=x, y=y, dark_us=dark_us, duty=999) for x, y in places]
 
 
 def check_frames(core, since_us):
@@ -58,10 +49,10 @@ def check_places(core, points):
     assert sent == [place for place, _ in groupby([(32768, 32768), *(point[:2] for point in points)])]
 
 
-@every_frame
 def test_each_10_us_have_a_frame_with_the_position_of_the_points_even_when_the_core_has_stopped(bench):
     host = bench.ready(act("stop_tick"), settle_us=50, settle_ns_per_code=0, spot_leak_uw=4_000_000_000, **PATIENT)
     core, points = host.board.core, draw_points(500, 1)
+    core.play_every_frame()
     assert host.play(*points) == []
     host.wait_for_change("job done")
     check_places(core, points)
@@ -89,7 +80,7 @@ def test_each_10_us_have_a_frame_with_the_position_of_the_points_even_when_the_c
     ids=["parity inverted", "control bits wrong", "frames dropped", "a bit short"],
 )
 def test_wrong_frames_are_detected(tmp_path, mutant, expected):
-    core = ThoroughPico(PicoImage(tmp_path, mutant), None, lambda entry: None, 1)
+    core = EmulatedDigitalPico(PicoImage(tmp_path, mutant), None, lambda entry: None, 1)
     core.advance(20_000)
     core.count_frames()
     assert expected <= {what for _, what in core.frame_errors}
@@ -133,7 +124,7 @@ def test_each_bad_status_is_a_fault_within_200_us_and_a_single_one_is_none(bench
     core = host.board.core
     slowest_us = 0
     for kind in BAD_ANSWERS:
-        for wait_us in range(0, 100, 17):
+        for wait_us in range(0, 100, 34):
             slowest_us = max(slowest_us, change_answer(host, kind, wait_us))
             repair(host)
     print(f"fault HEAD after {slowest_us} µs at most")
@@ -172,23 +163,22 @@ def test_a_head_that_is_not_ready_turns_the_gate_off_within_200_us(bench, kind):
     print(f"gate off {off_us - since_us:.0f} µs after the status")
 
 
-@every_frame
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("piece", range(1, PIECES + 1), ids="minute-{}".format)
 def test_an_emulated_minute_has_no_gap(bench, piece):
-    host = bench.ready(settle_us=50, settle_ns_per_code=0, spot_leak_uw=4_000_000_000, **PATIENT)
+    host = bench.greeted(settle_us=50, settle_ns_per_code=0, spot_leak_uw=4_000_000_000, **PATIENT)
     core = host.board.core
-    points = draw_points(int((PIECE_S - 2.2) / 300e-6), piece)
-    assert host.play(*points[:1000], end=False) == []
-    at = 1000
-    while at < len(points):
-        if at < len(host.board.of("pulse")) + 1800:
-            assert host.send_checked("DATA", first_index=at, points=points[at : at + 24]) == []
-            at += 24
-        else:
-            host.pause(0.02)
-    host.send("END", job=1, end_index=len(points))
+    core.play_every_frame()
+    host.arm()
+    points = draw_points(int((PIECE_S - 2.5) / 500e-6), piece, dark_us=400)
+    assert host.play(*points[:960], end=False) == []
+    while host.index < len(points):
+        host.lease()
+        host.receive()
+        while host.index < min(len(points), len(host.board.of("pulse")) + 1500):
+            host.raw(host.data(*points[host.index : host.index + 24]))
+    assert host.send_checked("END", job=1, end_index=len(points)) == []
     host.wait_for_change("job done")
     core.advance(max(1e6 * PIECE_S, core.chip_us))
     check_places(core, points)

@@ -128,8 +128,6 @@ class EmulatedPico:
     """A Pico with its circuit. settings: None for those of the image. sink: receives each log event."""
 
     lease_until_us = 0
-    plays_every_frame = True
-    """Whether a frame of XY2-100 that is as the last one is played, too, and not only counted."""
     FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate", *ANSWERS)
 
     def __init__(self, image, settings, sink, seed=None):
@@ -147,7 +145,6 @@ class EmulatedPico:
         flash = image.with_settings(settings) if settings else image.flash
         setup = {"emulator": str(EMULATOR), "image": flash.hex(), "symbols": image.symbols, "offsets": image.offsets}
         setup |= {"seed": int.from_bytes(os.urandom(4)) if seed is None else seed + 1, "lateNanos": LATE_TICK_US * 1000}
-        setup["everyFrame"] = self.plays_every_frame
         with tempfile.NamedTemporaryFile("w", suffix=".json", delete=False) as file:
             json.dump(setup, file)
         self._process = subprocess.Popen(
@@ -237,6 +234,10 @@ class EmulatedPico:
         """Return the longest tick and the longest time between two since the last call, µs."""
         self._command("ticks")
         return self.ticks_us
+
+    def play_every_frame(self):
+        """From now on, play also a frame of XY2-100 that is as the last one, in place of counting it."""
+        self._command("everyFrame")
 
     def count_frames(self):
         """Return the number of XY2-100 frames since power-up or reset; what is wrong with any is in `frame_errors`."""
@@ -341,8 +342,6 @@ class EmulatedPico:
 
 class EmulatedDigitalPico(EmulatedPico):
     """A Pico with a digital scan head, by XY2-100."""
-
-    plays_every_frame = False
 
     def __init__(self, image, settings, sink, seed=None):
         super().__init__(image, replace(settings or BoardSettings(), interface="xy2-100"), sink, seed)
