@@ -114,16 +114,12 @@ def build_terms_reference() -> str:
     parts = [TERMS_HEAD]
     for key, term in sorted(discover_terms().items()):
         about = describe_term(term)
-        units: dict[str, list[str]] = {}
-        for item in about["parameters"]:
-            units.setdefault(item["unit"], []).append(f"`{item['name']}`")
-        names = "; ".join(f"{', '.join(named)} ({unit})" for unit, named in units.items())
         notes = [f"Needs {', '.join(f'`{name}`' for name in term.requires)}."] if term.requires else []
         if not term.in_pixel:
             notes.append("Only the limiter accounts for it; heights are not planned with it.")
         if term.signature:
             notes.append(f"Visible in {term.signature}.")
-        text = [about["label"][:1].upper() + about["label"][1:] + f". Parameters: {names}.", "", about["equation"]]
+        text = [about["label"][:1].upper() + about["label"][1:] + ".", "", about["equation"]]
         parts.append("\n".join([f"## `{key}`", "", *text, *notes, ""]))
     return "\n".join(parts)
 

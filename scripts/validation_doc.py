@@ -142,9 +142,9 @@ def build_diagnosis_section():
 
 
 def keep_findings(lines):
-    """Return the lines on the named causes, without those on the assumptions and on all other causes."""
-    others = next((k for k, line in enumerate(lines) if line.startswith(("Assumptions", "Other causes"))), len(lines))
-    return [*(line for line in lines[:others] if "Evidence:" not in line), "…"]
+    """Return the lines on the best sets, without those on single causes."""
+    causes = next((k for k, line in enumerate(lines) if line.startswith("Causes of")), len(lines))
+    return [*lines[:causes], *(line for line in lines if line.startswith("With these")), "…"]
 
 
 def format_quote(lines):

@@ -30,7 +30,7 @@ is true.
 
 No method blocks and no client is waited for: the process has the highest priority of the daemon, its loop is bounded by
 `WAIT_MAX_S`, and `pop_outgoing` returns what is to be sent. Malformed messages end their client, not the loop. The
-interleavings are checked by a SPIN model (`firmware_protocol/model/epochs.pml`). Decisions: 31, 35, 37.
+interleavings are checked by a SPIN model (`firmware_protocol/model/epochs.pml`). Decisions: 35, 37.
 """
 
 from typing import Any, NamedTuple
