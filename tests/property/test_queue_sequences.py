@@ -400,3 +400,13 @@ def test_a_wrong_transition_is_caught(message):
     happen(machine)
     with pytest.raises(AssertionError, match=message):
         machine.teardown()
+
+
+def test_a_plan_that_never_began_leaves_no_heat_when_the_link_is_lost():
+    """The host stalls beyond its start until the lease has ended, before the queue could hand it over."""
+    machine = QueueMachine()
+    machine.accept_frame(20, 30.0)
+    for stall_s in (0.03, 0.03, 0.03):
+        machine.report_late(stall_s, True)
+    machine.teardown()
+    assert [push.record.status for push in machine.pushed] == ["failed"]

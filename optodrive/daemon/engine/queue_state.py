@@ -243,7 +243,7 @@ class QueueState:
         """End all running and waiting plans."""
         state = replace(self, waiting=()).end_running(status, error, light)
         if not self.running and self.waiting:
-            state = state._rewind(self.waiting[:1], light)
+            state = state._take_back(self.waiting[0], light, 0, self.end_s)
         return state._end(self.waiting, status, error)
 
     def preempt(self, sent: int, light: LightEnd) -> "QueueState":
@@ -259,10 +259,7 @@ class QueueState:
             at = ids.index(plan_id)
             plan, end_s = self.waiting[at], self.end_s
             state = replace(self, waiting=self.waiting[:at] + self.waiting[at + 1 :])
-            if plan.is_interrupted:
-                state = state._rewind([plan], light, at)
-            else:
-                state = state._go_back(plan)._continue_from(at, end_s, light)
+            state = state._take_back(plan, light, at, end_s)
             return state._end([plan], PlanStatus.CANCELLED, error or "removed from the queue")
         if any(run.plan.plan_id == plan_id for run in self.running):
             return self.end_running(PlanStatus.CANCELLED, error or "cancelled while running", light)
@@ -363,6 +360,12 @@ class QueueState:
         estimate = estimate_before_rest(plan, self.budget, self.on_progress)
         # Pulses that were trimmed to nothing end later than the budget's time, and the heat is known from their end on.
         return self._count(estimate, max(estimate.budget.at_s, plan.record.start_s))
+
+    def _take_back(self, plan: ActivePlan, light: LightEnd, at: int, end_s: float) -> "QueueState":
+        """Continue without a plan that waited, behind which those from index `at` on wait."""
+        if plan.is_interrupted:
+            return self._rewind([plan], light, at)
+        return self._go_back(plan)._continue_from(at, end_s, light)
 
     def _rewind(self, ended: Sequence[ActivePlan], light: LightEnd, at: int = 0) -> "QueueState":
         """Count only the pulses that plans which were removed may have executed.
