@@ -20,6 +20,7 @@ from optodrive.physics.parameters import load_parameters
 from optodrive.planning.stimuli.frame_json import parse_live_frame
 from optodrive.planning.stimuli.sequence_file import parse_sequence
 from optodrive.study.study_file import EXPERIMENTS, list_shipped_studies, load_study
+from optodrive.study.trial_stimulus import check_stimuli
 from sound_files import write_toml
 
 FREE = {
@@ -27,10 +28,11 @@ FREE = {
     ("mirrors.toml", "axes"),
     ("field.toml", "about"),
     ("pixels.toml", "about"),
-    *((f"{name}.toml", part) for name in list_shipped_studies() for part in ("factors", "stimulus.parameters")),
+    *((f"{name}.toml", "factors") for name in list_shipped_studies()),
 }
-"""Tables whose keys are free: what a file was made from, for people, and parameters of a pattern, which checks them."""
+"""Tables whose keys are free: what a file was made from, for people, and factors."""
 UNKNOWN = "surely_unknown"
+DISPLAY = load_config("display-437")
 READERS = {"calibrated.toml": load_parameters, "display-437.toml": lambda path: load_config(str(path))}
 """Readers that are faster than those that plan with the file."""
 
@@ -64,7 +66,7 @@ def list_sound_files(folder):
         yield (
             f"{name}.toml",
             tomllib.loads((EXPERIMENTS / f"{name}.toml").read_text()),
-            lambda path: load_study(str(path)),
+            lambda path: check_stimuli(load_study(str(path)), DISPLAY),
         )
 
 
