@@ -25,6 +25,7 @@ from optodrive.daemon.engine.planner import HORIZON_MAX_S, HORIZON_MIN_S, Stream
 from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.protocol.quantisation import DUTY_MAX
+from optodrive.physics.discovered_term import KEY, KNOTS, DiscoveredTerm
 from optodrive.planning.batch_limiter import BatchLimiter
 from planner_rig import PlannerRig, build_frame, build_train
 
@@ -115,6 +116,19 @@ def test_a_part_does_not_end_with_the_gate_off():
     sequence = draw_frame(np.random.default_rng(1), len(display.pixels))
     assert make(dark, sequence, begin(dark), 0.02).growth is None
     assert make(display, sequence, begin(display), 0.02).growth is not None
+
+
+def test_a_frame_that_a_discovered_term_may_refuse_is_planned_as_a_whole():
+    """Its first part would play already when the second one leaves the range of the term's data."""
+    table = {"where": "displacement", "depends_on": "gas", "unit": "m", "formula": "f", "source": "here"}
+    term = DiscoveredTerm.model_validate(table | {"low": 0.0, "high": 100.0, "values": [0.0] * KNOTS})
+    display = DISPLAYS["display-437"]
+    found = display.parameters.model_copy(update={"discovered": (term,), "planner_terms": (KEY,)})
+    extended = replace(display, parameters=found)
+    target_m = np.where(np.arange(len(display.pixels)) < 40, 50e-6, 0.0)
+    sequence = FrameSequence((TactileFrame("f", 0.0, 3600.0, target_m),))
+    assert make(display, sequence, begin(display), 0.02).growth is not None
+    assert make(extended, sequence, begin(extended), 0.02).growth is None
 
 
 @pytest.mark.parametrize(
