@@ -1,5 +1,6 @@
 """The report of a study: results by participant and of the group, as numbers, as lines and as one HTML page."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from math import exp, log
@@ -12,11 +13,13 @@ from optodrive.core.provenance import Provenance
 from optodrive.core.svg_plot import Axis, Series, draw_plot
 from optodrive.study.results import Accuracy
 from optodrive.study.trial_table import (
+    MISSING,
     GroupMean,
     ThresholdResult,
     Trial,
     TrialTable,
     compute_group_mean,
+    count_correct,
 )
 
 CURVES_MAX = 60
@@ -43,18 +46,19 @@ class StudyResults:
             self.accuracy = self.accuracy._replace(low=low, high=high)
 
     @property
-    def threshold(self) -> GroupMean | None:
-        """Geometric mean of the participants' thresholds, each the mean of its own. Bounds do not enter."""
-        values: dict[str, list[float]] = {}
+    def group_thresholds(self) -> dict[str, GroupMean]:
+        """Geometric mean of the participants' thresholds in each block, '' of a single one. Bounds do not enter."""
+        values: dict[str, dict[str, list[float]]] = {}
         for one in self.thresholds:
             level = one.equality if one.estimate is None else one.estimate.threshold
             if level is not None:
-                values.setdefault(one.participant, []).append(log(level))
-        if not values:
-            return None
-        mean = compute_group_mean([float(np.mean(each)) for each in values.values()])
-        low, high = (None if end is None else exp(end) for end in (mean.low, mean.high))
-        return GroupMean(exp(mean.mean), low, high, mean.participants)
+                values.setdefault(one.block, {}).setdefault(one.participant, []).append(log(level))
+        found = {}
+        for block, people in values.items():
+            mean = compute_group_mean([float(np.mean(each)) for each in people.values()])
+            low, high = (None if end is None else exp(end) for end in (mean.low, mean.high))
+            found[block] = GroupMean(exp(mean.mean), low, high, mean.participants)
+        return found
 
     def to_document(self) -> dict[str, Any]:
         """Return the results as JSON values."""
@@ -94,7 +98,7 @@ class StudyResults:
                     "magnitudes": self.magnitudes,
                     "group": {
                         "accuracy": None if self.accuracy is None else self.accuracy._asdict(),
-                        "threshold": None if self.threshold is None else self.threshold._asdict(),
+                        "thresholds": {block: mean._asdict() for block, mean in self.group_thresholds.items()},
                     },
                     "execution": _describe_execution(table.trials),
                 }
@@ -116,8 +120,8 @@ class StudyResults:
         if self.accuracy is not None:
             chance = "" if table.guess_rate is None else f" (by guessing {100 * table.guess_rate:.1f} %)"
             yield f"- Correct answers: {_format_mean(self.accuracy, 100.0, ' %')}{chance}."
-        if self.threshold is not None:
-            yield f"- {self._name_level()}: {_format_mean(self.threshold, 1.0, '')}."
+        for block, mean in self.group_thresholds.items():
+            yield f"- {self._name_level()}{block and f', {block}'}: {_format_mean(mean, 1.0, '')}."
         if bounds := sum(one.estimate is not None and one.estimate.threshold is None for one in self.thresholds):
             yield f"- {bounds} of {len(self.thresholds)} thresholds are bounds or not determined, and do not enter."
         yield from (f"- {name} is flagged {flag}: {flag.explanation}." for name, flag in self._list_flags())
@@ -143,6 +147,10 @@ class StudyResults:
         if self._is_choice and len(table.correct_answers) > 1:
             text = "Number of main trials of all participants. Rows: the correct answer; columns: the answer given."
             sections.append(Section("Confusions", [text, self._build_confusions()]))
+        factors = [name for name in table.analysis["Factors"] if any(name in trial.cells for trial in table.main)]
+        if table.answers and factors:
+            text = "Number of main trials of all participants with each answer, and the share that is correct."
+            sections.append(Section("Answers by factor", [text, *(self._build_factor(name) for name in factors)]))
         if self.magnitudes:
             sections.append(Section("Magnitudes", self._build_magnitudes()))
         sections.append(Section("Stimuli as requested and as executed", [self._build_execution()]))
@@ -226,6 +234,17 @@ class StudyResults:
         ]
         head = ("correct answer", *table.answers, "correct")
         return Table("Confusions", head, rows, range(1, len(head)))
+
+    def _build_factor(self, factor: str) -> Table:
+        table, rows = self.table, []
+        levels = dict.fromkeys(trial.cells.get(factor, MISSING) for trial in table.main)
+        for level, _ in sorted(levels.items(), key=_sort_level):
+            own = [trial for trial in table.main if trial.cells.get(factor, MISSING) == level]
+            answers = Counter(trial.cells["answer"] for trial in own)
+            accuracy = count_correct(own)
+            rows.append((level, *(str(answers[each]) for each in table.answers), *_format_accuracy(accuracy)))
+        head = (factor, *table.answers, "correct", "95 % interval")
+        return Table(f"Answers by {factor}", head, rows, range(1, len(head)))
 
     def _build_magnitudes(self) -> Iterator[str | Table]:
         yield "Geometric mean of a participant's answers by level, divided by that of all levels."

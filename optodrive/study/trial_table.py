@@ -194,12 +194,12 @@ class TrialTable:
         main = [trial for trial in self.main if trial.participant == participant]
         counts = Counter(trial.kind for trial in own)
         times_s = [t_s for trial in main if (t_s := trial.read_number("response_time")) is not None]
-        accuracy = _count(main)
+        accuracy = count_correct(main)
         return ParticipantResult(
             participant,
             {kind: counts[kind] for kind in KINDS},
             accuracy,
-            _count([trial for trial in own if trial.kind == "catch"]),
+            count_correct([trial for trial in own if trial.kind == "catch"]),
             float(np.median(times_s)) if times_s else None,
             () if accuracy is None else tuple(self._list_flags(main, accuracy)),
         )
@@ -324,7 +324,7 @@ def _find_kind(row: Mapping[str, str]) -> str:
     return "catch" if row.get("is_catch") == "1" else "main"
 
 
-def _count(trials: Sequence[Trial]) -> Accuracy | None:
+def count_correct(trials: Sequence[Trial]) -> Accuracy | None:
     """Return the correct answers of the trials that have one, None if there is none."""
     judged = [trial.is_correct for trial in trials if trial.is_correct is not None]
     return Accuracy(sum(judged), len(judged)) if judged else None

@@ -97,8 +97,9 @@ def test_a_threshold_a_bound_and_exchanged_keys_are_stated_as_such(tmp_path):
     assert below.high <= 100.0
     assert exchanged[:3] == (None, None, None)
     assert results.participants[2].flags == exchanged.flags == ("exchanged-keys",)
-    assert results.threshold.participants == 2
-    assert results.threshold.mean == pytest.approx(np.sqrt(clear.threshold * other.threshold))
+    (mean,) = results.group_thresholds.values()
+    assert mean.participants == 2
+    assert mean.mean == pytest.approx(np.sqrt(clear.threshold * other.threshold))
     assert "2 of 4 thresholds are bounds or not determined" in "\n".join(results.list_lines())
 
 
@@ -152,7 +153,19 @@ def test_sessions_and_blocks_have_thresholds_of_their_own(tmp_path):
     assert [one[1:3] for one in results.thresholds] == [("1", "a"), ("1", "b"), ("2", "a"), ("2", "b")]
     low, high = (np.mean([one.estimate.threshold for one in results.thresholds[k : k + 2]]) for k in (0, 2))
     assert 4.0 < high / low < 9.0
-    assert results.threshold.participants == 1
+    assert [(block, mean.participants) for block, mean in results.group_thresholds.items()] == [("a", 1), ("b", 1)]
+
+
+def test_answers_are_counted_by_factor(tmp_path):
+    rows = [{**row, "block": str(k % 2)} for k, row in enumerate(answer_levels(1))]
+    write_table(tmp_path, "01", rows, level=None, Factors=["level", "block"])
+    page = judge(tmp_path).to_html()
+    for level in LEVELS:
+        own = [row for row in rows if row["level"] == level]
+        left = sum(row["answer"] == "left" for row in own)
+        correct = sum(row["answer"] == row["correct_answer"] for row in own)
+        cells = f"<td>{level}</td><td class='n'>{left}</td><td class='n'>{12 - left}</td><td class='n'>{correct} of 12"
+        assert cells in page
 
 
 def test_the_mean_over_participants_has_students_interval():
