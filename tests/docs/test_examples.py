@@ -108,6 +108,7 @@ DRAWINGS = {
     "docs/explanation/architecture.md": ("FrameSequence →", "core < device"),
     "docs/how-to/reach-it-from-the-network.md": ("lab.example {", "server {", "location /lab/"),
     "docs/how-to/wire-a-board.md": ("PC ── USB",),
+    "docs/how-to/wire-a-scan-head.md": ("GP16 ── 1A",),
     "docs/how-to/discover-a-term.md": ("from optodrive.lab.discovery import ",),
     "docs/reference/recordings.md": ("/        ", "recording.toml   "),
 }
