@@ -30,6 +30,8 @@ from optodrive.cli.commands import UsageError, build_app, name_default
 ELSEWHERE = {
     "scripts/": "scripts of the checkout, which are run as they are",
     "optodrive board": "tests/firmware/test_board_build.py, tests/unit/cli/test_board_flash.py",
+    "SILVERBOX_CSV=": "tests/accuracy/test_discovery.py, where the file is at hand",
+    "optodrive discover damper.py": "measured data that is not part of the repository",
     "python tests/blind/blind_instruments.py": "tests/blind/test_instruments.py runs its cases",
     "python3 -m venv": "tests/system/test_wheel.py checks the wheel",
     "/opt/optodrive/": "tests/system/test_service.py runs the commands of the service",
