@@ -153,7 +153,8 @@ def peak_after_off_m(
         done_s += interval_s
         has_decayed = done_s > DECAYED_TIME_CONSTANTS * pixel.tau_g_s
         displacement_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
-        if has_decayed and not displacement_m > DECAYED_SHARE * peak_m:  # so that what is no number ends it, too
+        # So that what is no number ends it, too. A cold pixel stays where a table's rounding at 0 puts it.
+        if has_decayed and (not displacement_m > DECAYED_SHARE * peak_m or _is_cold(work[0])):
             break
     return peak_m
 

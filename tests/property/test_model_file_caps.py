@@ -510,6 +510,14 @@ def test_what_a_gas_reaches_after_the_last_pulse_counts(is_mutant, tmp_path, mon
             check_feasibility(display, ONE_PULSE, *display.build_cold_state())
 
 
+@pytest.mark.timeout(120)
+def test_a_displacement_that_is_not_exactly_0_on_a_cold_pixel_ends_a_plan(tmp_path):
+    write_model(tmp_path / "model.toml", USUAL, [build_term("displacement", "gas", 0.0, 200.0, [5e-12] * KNOTS)], False)
+    display = load_display(tmp_path / "model.toml", {"absorber_max_c": 400.0, "wall_max_c": 80.0, "touch_max_c": 80.0})
+    sequence = FrameSequence((TactileFrame("one", 0.0, 0.5, np.array([5e-5])),), ())
+    assert len(check_feasibility(display, sequence, *display.build_cold_state())[0].plan)
+
+
 OFFSET = [2.0, *[0.0] * (KNOTS - 2), -2.5e6]
 
 
