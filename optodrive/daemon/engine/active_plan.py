@@ -206,7 +206,8 @@ class ActivePlan:
         the budget after it stays the bound for what it was made for. None: as before, or as the rows state
         rows: None for the same ones
         """
-        plan, changes = self, {"start_s": start_s}
+        plan, record = self, self.record
+        changes = {"start_s": start_s, "folded_delay_s": record.folded_delay_s + start_s - record.start_s}
         if rows is not None:
             plan = replace(plan, planned=rows.planned, points=rows.points, crc=rows.crc, growth=None)
             changes |= describe_rows(rows.planned) | {"summary_json": rows.summary_json}

@@ -202,7 +202,7 @@ class PlanQueue:
                 # Later is safe for the skin, but a bump from less heat is lower.
                 if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > COOLING_MAX_M:
                     return None
-                plan = plan.rebase(start_s, snapshot.thermal.shift(-start_s))
+                plan = plan.rebase(start_s, snapshot.thermal.shift(-start_s)).note(folded_delay_s=0.0)
             self._apply(state.accept(plan))
         return self._plan_store.find(plan.plan_id)
 

@@ -110,7 +110,7 @@ class PlanRecord:
 
     pulse_count, duration_s: of the whole plan; summary_json: encoded `PlanSummary`, which is larger in memory
     pulses: None if there are too many to list
-    start_s: board time of the plan's zero; folded_delay_s: by how much interruptions have shifted it
+    start_s: board time of the plan's zero; folded_delay_s: by how much it was shifted after it was accepted
     arrived_s, arrived_host_s: time of the request, of board and host; *_after_s: time from the request to an event
     caller: name of the token that submitted it
     labels, parameters: of the caller, and of the pattern
@@ -191,7 +191,7 @@ class PlanRecord:
             max_target=self._report_max_target(execution),
             executed_pulses=execution.to_columns() if pulses and execution is not None else None,
             executed_complete=None if execution is None else execution.complete,
-            delay_s=None if execution is None else self.delay_s,
+            delay_s=None if execution is None else self.delay_s + self.folded_delay_s,
         )
 
     def _report_onset(self, clocks: ClockReading | None) -> PlanOnset | None:

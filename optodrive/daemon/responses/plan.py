@@ -108,7 +108,8 @@ class PlanReport(JsonModel):
 
     caller: name of the token that submitted it; labels: its own; parameters: all of the pattern, a file as its digest
     pulses, executed_pulses: None if they were not requested or are too many
-    executed_complete, delay_s: None before the plan has ended
+    executed_complete: None before the plan has ended
+    delay_s: by how much it began later than planned when it was accepted, None before it has ended
     onset: None without a pulse, for a dry run, and without a synchronised clock
     plan: id of the plan
     name: of its pattern, or push

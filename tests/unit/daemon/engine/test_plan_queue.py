@@ -159,6 +159,23 @@ def test_on_cold_pixels_a_late_plan_is_as_good(rig, attempts, streamed):
     assert record.execution.simulated_m == pytest.approx([300e-6], rel=0.01)
 
 
+@pytest.mark.parametrize("warm", [False, True])
+@pytest.mark.parametrize("stall_s", [0.0, 0.07])
+def test_the_report_states_by_how_much_a_plan_began_later_than_it_was_accepted_for(rig, stall_s, warm):
+    """After a stall between acceptance and start, light moves on cold pixels, and is planned anew on warm ones."""
+    if warm:
+        first = submit(rig, build_frame(300.0, (5,), 0.02))
+        rig.until(lambda: first.executed_count == 1)
+    accepted = submit(rig, build_frame(300.0, (5,), 0.02))
+    planned_s, first_pulse_s = accepted.start_s, accepted.first_pulse_s
+    rig.clock.sleep(stall_s)
+    record = finish(rig, accepted)
+    light_s = record.arrived_s + record.first_light_after_s
+    delay_s = record.build_report(0.0).delay_s
+    assert delay_s == pytest.approx(light_s - (planned_s + first_pulse_s), abs=1e-4)
+    assert (delay_s > 0.02) == (stall_s > 0.0)
+
+
 @pytest.mark.parametrize("streamed", [True, False])
 def test_a_plan_that_is_late_again_and_again_is_made_until_it_is_in_time(rig, attempts, streamed):
     record = show_after_another(rig, [0.08, 0.1, 0.12], streamed)
