@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.lab.inspection.response_faults import (
     INDEPENDENT,
     TEMPERATURE,
@@ -45,6 +45,8 @@ BEND_REACH = 3.0
 """Widths of the bend that are left out before it."""
 BEND_ERROR = 0.02
 """Error of its place, relative to the largest response."""
+OUTLYING = 10.0
+"""Residual of a mean that holds an outlier, in medians of all."""
 OWN_LEAVES = 1.3
 """Variance that bends of each run leave at least, relative to that left by a common one."""
 _Means = tuple[FloatArray, FloatArray, int, FloatArray]
@@ -52,13 +54,18 @@ _Means = tuple[FloatArray, FloatArray, int, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class _Bend:
-    """Signals as a function of the light's response with one bend: rest of variance, slopes, significance, response."""
+    """Signals as a function of the light's response with one bend: residuals, slopes, significance, response."""
 
-    left: float
+    residual: FloatArray
     below: float
     beyond: float
     sigmas: float
     x: FloatArray
+
+    @property
+    def left(self) -> float:
+        """Rest of the variance."""
+        return float(self.residual @ self.residual)
 
 
 def find_saturation(work: Work, name: str) -> tuple[float, float, float] | None:
@@ -70,11 +77,16 @@ def find_saturation(work: Work, name: str) -> tuple[float, float, float] | None:
     if len(members) < MIN_BEND_RUNS:
         return None
     value = np.concatenate([mean for _, _, _, mean in members])
-    found = _fit_bend(members, name, value, is_own=False)
+    kept = np.ones(len(value), dtype=np.bool_)
+    size = np.abs(_fit_bend(members, name, value, kept, is_own=False).residual)
+    # Outliers are sought after the ends of the range, and a few samples far off would turn the line that shows a bend.
+    kept = size <= OUTLYING * np.median(size)
+    value = value[kept]
+    found = _fit_bend(members, name, value, kept, is_own=False)
     if min(found.below, found.beyond) > LEVEL_SLOPE * max(found.below, found.beyond) or found.sigmas < BEND_SIGMAS:
         return None
     is_high, excess, y = found.below > found.beyond, _bend(found.x), value - value.mean()
-    if is_high and _fit_bend(members, name, value, is_own=True).left < OWN_LEAVES * found.left:
+    if is_high and _fit_bend(members, name, value, kept, is_own=True).left < OWN_LEAVES * found.left:
         return None  # each run bends at a share of its own largest response, as where the light itself falls
     parts = found.x[:, None] - excess if is_high else excess
     centred = parts - parts.mean(axis=0)
@@ -87,25 +99,30 @@ def find_saturation(work: Work, name: str) -> tuple[float, float, float] | None:
     return (1.0 if is_high else -1.0), float(ends[at]), float(reach)
 
 
-def _fit_bend(members: list[_Means], name: str, value: FloatArray, *, is_own: bool) -> _Bend:
-    """Return the best bend, at a value of all runs, or at a share of each run's own largest response."""
-    y, best = value - value.mean(), _Bend(np.inf, 1.0, 1.0, 0.0, value)
+def _fit_bend(members: list[_Means], name: str, value: FloatArray, kept: BoolArray, *, is_own: bool) -> _Bend:
+    """Return the best bend, at a value of all runs, or at a share of each run's own largest response.
+
+    value: the means that are kept
+    """
+    y = value - value.mean()
+    best = _Bend(y, 1.0, 1.0, 0.0, value)
     for tau_s in BEND_TAUS_S:
         templates = ((compute_template(pulses, t_s, tau_s, get_second_s(name)), n) for pulses, t_s, n, _ in members)
         own = [template.reshape(-1, size).mean(axis=1) for template, size in templates]
-        x = np.concatenate(own)
+        x = np.concatenate(own)[kept]
         x /= max(float(x.max()), 1e-300)
-        scale = np.concatenate([np.full(len(item), item.max()) for item in own]) if is_own else np.ones(len(x))
+        scale = np.concatenate([np.full(len(item), item.max()) for item in own])[kept] if is_own else np.ones(len(x))
         excess, line = scale[:, None] * _bend(x / scale), x - x.mean()
         slope, along = float(line @ y / (line @ line)), line @ excess / (line @ line)
         beside = excess - excess.mean(axis=0) - line[:, None] * along
         weight = np.maximum((beside**2).sum(axis=0), 1e-9)
         turns = y @ beside / weight
         at = int(np.argmax(turns**2 * weight))
-        left = float(((y - slope * line - turns[at] * beside[:, at]) ** 2).sum())
+        residual = y - slope * line - turns[at] * beside[:, at]
+        left = float(residual @ residual)
         if left < best.left:
             below, error = slope - turns[at] * along[at], np.sqrt(INDEPENDENT * left / len(y) / weight[at])
-            best = _Bend(left, float(below), float(below + turns[at]), float(abs(turns[at]) / error), x)
+            best = _Bend(residual, float(below), float(below + turns[at]), float(abs(turns[at]) / error), x)
     return best
 
 
