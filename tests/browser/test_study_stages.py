@@ -161,8 +161,9 @@ def test_every_sentence_is_true_from_the_first_trial_to_the_last(make_study, bro
         ("form", "2 trials", "Questions", "Please answer each question."),
         ("done", "All 2 trials", "Finished", "Thank you. You may take your finger away."),
     ]
-    # Of the states between, the page gets the newest one alone; those that last for a pause are all seen.
-    between = list(dict.fromkeys(each[1:] for each in seen if each[0] == "rest"))
+    # Of the states between, the page gets the newest one alone; those that last for a pause are all seen. An answer may
+    # be seen before it is known what follows, as at the end: each state counts where it was seen last.
+    between = list(dict.fromkeys(each[1:] for each in reversed(seen) if each[0] == "rest"))[::-1]
     wrong = "Your answer: first. Not correct. The correct answer: second. The next stimulus comes."
     lasting = [
         ("Practice trial 1", "Wait", "The next stimulus comes."),
