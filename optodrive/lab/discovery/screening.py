@@ -363,13 +363,18 @@ def _solve(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def _held_loss(fitted: FloatArray, held: FloatArray, q: int, c: int, penalty: FloatArray | None) -> float:
-    """Return the squared error in a held fold of the regression on the others, on q parameters and c hats."""
+    """Return the squared error in a held fold of the regression on the others, on q parameters and c hats.
+
+    It is not finite where it cannot be computed.
+    """
     keep = np.arange(q + c)
     matrix = fitted[np.ix_(keep, keep)].copy()
     if penalty is not None:
         matrix[q:, q:] += penalty
     w = _solve(matrix, fitted[keep, -1])
-    return float(held[-1, -1] - 2.0 * w @ held[keep, -1] + w @ held[np.ix_(keep, keep)] @ w)
+    # Of a parameter that the other folds do not show, rounding leaves any weight: the loss may be infinite.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(held[-1, -1] - 2.0 * w @ held[keep, -1] + w @ held[np.ix_(keep, keep)] @ w)
 
 
 def _project(total: FloatArray, q: int) -> tuple[FloatArray, FloatArray, float]:
