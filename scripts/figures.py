@@ -31,7 +31,7 @@ SHOWN = {
     "memory": r"at rest|first answer",
     "stream": r"^(?!.*truncates).*(first light|^(WebSocket: )?arrival to first byte|^round trip.*bare|"
     r"frame of (200|1511).*, limited|shown per second of (20|60|200)|underruns)",
-    "stop": r".",
+    "stop": r"gate off|after STOP",
     "fingers": r"dots under|first light",
 }
 """Rows of each benchmark that the page shows, by a pattern within their quantity."""
