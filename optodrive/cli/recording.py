@@ -1,4 +1,4 @@
-"""`optodrive recording convert | show | merge | trials`: convert, inspect and merge recordings."""
+"""`optodrive recording convert | import | show | merge | trials`: convert, import, inspect and merge recordings."""
 
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from optodrive.lab.recording.trials import Trial
 if TYPE_CHECKING:
     from optodrive.core.types.measurements import Measurement
+    from optodrive.lab.recording.instrument_files import InstrumentFile
 
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Output of `serve --record-session`.")]
@@ -137,6 +138,96 @@ def show(
     if out is not None:
         part = "" if plotted_runs == len(runs) else f", the first {plotted_runs} of {len(runs)} runs"
         print(f"written          {out}{part}")
+
+
+@GROUP.command("import")
+def import_files(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="FILE...", help="Files to propose a map for."),
+    ] = None,
+    map_path: Annotated[
+        Path | None, typer.Option("--map", metavar="map.toml", help="What the columns are; it names the files.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="OUT", help="With --map: HDF5 (.h5, .hdf5), or a folder.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Make a recording of files of oscilloscopes and loggers by a map, or propose a map."""
+    from optodrive.core.errors import InputError, Unquoted
+    from optodrive.core.files import check_output
+    from optodrive.lab.recording.instrument_files import read_instrument_file
+    from optodrive.lab.recording.storage import HDF5_SUFFIXES
+
+    if map_path is None:
+        if not files or out is not None:
+            shown = Unquoted("--out without --map" if out is not None else "no file")
+            raise InputError("FILE", shown, "files to propose a map for, or --map map.toml --out OUT")
+        _propose_map([read_instrument_file(file) for file in files], json)
+        return
+    if files or out is None:
+        shown = Unquoted("files beside --map" if files else "--map without --out")
+        raise InputError("--map", shown, "--map map.toml --out OUT; the map names the files")
+    check_output("--out", out, *HDF5_SUFFIXES, folder=True)
+    _import_by_map(map_path, out, json)
+
+
+def _propose_map(files: "list[InstrumentFile]", json: bool) -> None:
+    from optodrive.lab.recording.import_map import propose_map
+
+    text = propose_map(files)
+    if json:
+        print_json({"files": [_describe_file(file) for file in files], "map": text})
+        return
+    for file in files:
+        _print_file(file, "# ")
+    print(f"\n{text}", end="")
+
+
+def _import_by_map(map_path: Path, out: Path, json: bool) -> None:
+    from optodrive.lab.inspection.inspection import inspect_recording
+    from optodrive.lab.inspection.page import build_finding, build_lines
+    from optodrive.lab.recording import write_recording
+    from optodrive.lab.recording.importing import import_recording
+
+    measurement, files = import_recording(map_path)
+    page = inspect_recording(measurement)
+    write_recording(out, measurement, f"imported by {map_path.name}")
+    if json:
+        data = [build_finding(item) for item in page.findings]
+        runs = [run.name for run in measurement.runs]
+        answer = {"written": str(out), "files": [_describe_file(file) for file in files], "runs": runs, "data": data}
+        print_json(answer)
+        return
+    for file in files:
+        _print_file(file)
+    print()
+    rows = [
+        [run.name, name, str(len(signal.t_s)), *(format_number(each, 5) for each in (signal.t_s[0], signal.value[0]))]
+        for run in measurement.runs
+        for name, signal in run.signals.items()
+    ]
+    print_table(("run", "signal", "samples", "first time, s", "first value"), rows, frozenset({"samples"}))
+    print("\n".join(["", *build_lines(page.findings, page.failures), "", *list_written(out)]))
+    if not any(len(run.pulses) for run in measurement.runs):
+        print("no pulses: state pulses or [gate] in the map, or merge with a session by `optodrive recording merge`")
+
+
+def _describe_file(file: "InstrumentFile") -> dict[str, Any]:
+    columns = [
+        {"column": column.key, "unit": column.unit, "samples": len(column.value), "first": column.value[:3].tolist()}
+        for column in file.columns
+    ]
+    return {"file": str(file.path), "notes": list(file.notes), "columns": columns}
+
+
+def _print_file(file: "InstrumentFile", prefix: str = "") -> None:
+    """Print the notes and the columns of a file with their first values."""
+    print(f"{prefix}{file.path}: {'; '.join(file.notes)}")
+    for column in file.columns:
+        first = ", ".join(format_number(value, 5) for value in column.value[:3])
+        print(f"{prefix}  {column.key} [{column.unit or 'no unit'}]: {len(column.value)} samples: {first}, …")
 
 
 @GROUP.command()
