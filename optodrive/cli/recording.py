@@ -12,11 +12,9 @@ from optodrive.cli.output import list_written, print_answer, print_json, print_t
 from optodrive.core.quantity import format_number, format_quantity
 
 if TYPE_CHECKING:
-    from optodrive.lab.recording.trials import Trial
-if TYPE_CHECKING:
     from optodrive.core.types.measurements import Measurement
     from optodrive.lab.recording.instrument_files import InstrumentFile
-
+    from optodrive.lab.recording.trials import Trial
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Output of `serve --record-session`.")]
 

@@ -8,7 +8,7 @@ be read in two ways, such as points and commas in the numbers of one file, is re
 import csv
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -19,11 +19,12 @@ import numpy as np
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.extras import import_extra
 from optodrive.core.files import read_bounded
+from optodrive.core.numeric_tables import MICRO, OTHER_UNITS
 from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.recording.storage import NUMBERS_MAX, convert_errors, format_name
 
-FILE_BYTES_MAX = 2**30
+FILE_BYTES_MAX, TEXT_BYTES_MAX = 2**30, 10**8
 SEPARATORS = "\t;, "
 GAPS = frozenset({"", "-", "--", "---", "nan", "n/a", "#n/a", "na", "null", "ol", "ovld", "over", "overflow"})
 """Cells without a number, in small letters: a gap, or an overload of the input."""
@@ -36,18 +37,15 @@ LINES_BEFORE_MAX = 200
 SAMPLED_LINES = 2000
 """Lines by which the separator is chosen."""
 
-MICRO = str.maketrans("µμ", "uu")
 UNITS_OF_FILES: dict[str, tuple[str, float, float]] = {
-    "m": ("m", 1.0, 0.0), "mm": ("m", 1e-3, 0.0), "um": ("m", 1e-6, 0.0), "nm": ("m", 1e-9, 0.0),
+    unit: (si, factor, 0.0) for si, others in OTHER_UNITS.items() for unit, factor in ({si: 1.0} | others).items()
+} | {
+    "nm": ("m", 1e-9, 0.0), "ns": ("s", 1e-9, 0.0), "min": ("s", 60.0, 0.0), "sec": ("s", 1.0, 0.0),
+    "Second": ("s", 1.0, 0.0), "°": ("rad", np.pi / 180.0, 0.0),
     "K": ("K", 1.0, 0.0), "°C": ("K", 1.0, ZERO_CELSIUS_K), "degC": ("K", 1.0, ZERO_CELSIUS_K),
     "°F": ("K", 5.0 / 9.0, ZERO_CELSIUS_K - 160.0 / 9.0),
-    "N": ("N", 1.0, 0.0), "mN": ("N", 1e-3, 0.0), "uN": ("N", 1e-6, 0.0),
-    "rad": ("rad", 1.0, 0.0), "mrad": ("rad", 1e-3, 0.0), "urad": ("rad", 1e-6, 0.0),
-    "deg": ("rad", np.pi / 180.0, 0.0), "°": ("rad", np.pi / 180.0, 0.0),
-    "s": ("s", 1.0, 0.0), "ms": ("s", 1e-3, 0.0), "us": ("s", 1e-6, 0.0), "ns": ("s", 1e-9, 0.0),
-    "min": ("s", 60.0, 0.0), "sec": ("s", 1.0, 0.0), "Second": ("s", 1.0, 0.0),
     "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0), "uV": ("V", 1e-6, 0.0), "Volt": ("V", 1.0, 0.0),
-    "A": ("A", 1.0, 0.0), "mA": ("A", 1e-3, 0.0), "W": ("W", 1.0, 0.0), "mW": ("W", 1e-3, 0.0),
+    "A": ("A", 1.0, 0.0), "mA": ("A", 1e-3, 0.0),
 }  # fmt: skip
 """SI unit, factor and offset of the units that instruments write."""
 
@@ -61,7 +59,7 @@ def find_unit(unit: str) -> tuple[str, float, float] | None:
 class Column:
     """One column of a file.
 
-    table: group, segment or length that it belongs to, empty in a text file; unit: as the file states it, or empty;
+    table: group or segment that it belongs to, or empty; unit: as the file states it, or empty;
     value: [m], NaN where a sample is missing; t_s: [m], times that the file implies by a rate, s
     """
 
@@ -114,7 +112,7 @@ def read_instrument_file(path: Path) -> InstrumentFile:
 
 
 def _read_text(path: Path) -> InstrumentFile:
-    text, encoding = _decode(read_bounded(path, FILE_BYTES_MAX))
+    text, encoding = _decode(read_bounded(path, TEXT_BYTES_MAX))
     lines = text.splitlines()
     separator = max(SEPARATORS, key=lambda each: _count_numbers(lines[:SAMPLED_LINES], each))
     rows = _split(lines, separator)
@@ -125,19 +123,20 @@ def _read_text(path: Path) -> InstrumentFile:
         raise InputError(str(path), found, "two or more columns, separated by tabs, semicolons, commas or spaces")
     names, units = _read_header(rows[:first], width)
     cells = _collect_cells(path, rows, first, width)
-    decimal = _find_decimal(path, cells, separator)
-    columns, gaps = [], 0
-    for at in range(width):
-        column = [row[at] for row in cells]
-        if all(cell.strip().lower() in GAPS for cell in column) or not _is_value(column[0]):
+    decimal = _find_decimal(path, cells)
+    columns, notes, gaps = [], [], 0
+    for name, unit, column in zip(names, units, zip(*cells, strict=True), strict=True):
+        stated = [cell for cell in column if cell.lower() not in GAPS]
+        # Some oscilloscopes state their settings in columns beside the first rows of numbers.
+        if not stated or (2 * len(stated) <= len(column) and not all(map(_is_value, stated))):
+            notes.append(f"{name!r} not read: {'empty' if not stated else 'text'}")
             continue
-        value = _parse_column(path, names[at], column, first + 1, decimal)
+        value, is_clock = _parse_column(path, name, column, decimal)
         gaps += int(np.isnan(value).sum())
-        is_clock = CLOCK.fullmatch(column[0]) is not None
-        columns.append(Column("", names[at], "s" if is_clock else units[at], value))
+        columns.append(Column("", name, "s" if is_clock else unit, value))
     shown = {"\t": "tab", " ": "space"}.get(separator, separator)
-    notes = (f"{encoding}, separator {shown!r}, decimal {decimal!r}", f"numbers from line {first + 1}, {gaps} gaps")
-    return InstrumentFile(path, tuple(columns), notes)
+    text_notes = f"{encoding}, separator {shown!r}, decimal {decimal!r}", f"numbers from line {first + 1}, {gaps} gaps"
+    return InstrumentFile(path, tuple(columns), (*text_notes, *notes))
 
 
 def _decode(content: bytes) -> tuple[str, str]:
@@ -220,33 +219,35 @@ def _collect_cells(path: Path, rows: list[list[str]], first: int, width: int) ->
     return cells
 
 
-def _find_decimal(path: Path, cells: list[list[str]], separator: str) -> str:
+def _find_decimal(path: Path, cells: list[list[str]]) -> str:
     """Return the decimal separator. Refuse a file whose numbers have both: one of them groups thousands."""
     numbers = [cell for row in cells for cell in row if NUMBER.fullmatch(cell)]
     has = {mark: next((cell for cell in numbers if mark in cell), None) for mark in ".,"}
     if has["."] is not None and has[","] is not None:
         found = Unquoted(f"{has['.']!r} and {has[',']!r}")
         raise InputError(str(path), found, "decimal points or decimal commas, not both")
-    return "," if has[","] is not None and separator != "," else "."
+    return "." if has[","] is None else ","
 
 
-def _parse_column(path: Path, name: str, cells: list[str], line: int, decimal: str) -> FloatArray:
-    value = np.empty(len(cells))
+def _parse_column(path: Path, name: str, cells: Sequence[str], decimal: str) -> tuple[FloatArray, bool]:
+    """Return the numbers of a column, or its times since the first, s, and whether these are of a clock."""
+    value, clocks = np.full(len(cells), np.nan), 0
     for at, cell in enumerate(cells):
         if NUMBER.fullmatch(cell):
             value[at] = float(cell.replace(",", "."))
-        elif cell.lower() in GAPS:
-            value[at] = np.nan
         elif (clock := CLOCK.fullmatch(cell)) is not None:
-            value[at] = _convert_clock(*clock.groups())
-        else:
+            value[at], clocks = _convert_clock(*clock.groups()), clocks + 1
+        elif cell.lower() not in GAPS:
             place = f"{path}: {format_name(name)}, row {at + 1} of the numbers"
             raise InputError(place, cell, f"a number with {decimal!r}, or an empty cell for a gap")
-    if CLOCK.fullmatch(cells[0]):
-        value -= value[0]
-        if np.any(np.diff(value) < 0) and not re.match(r"\d{4}-", cells[0]):
-            value += 86400.0 * np.concatenate([[0.0], np.cumsum(np.diff(value) < -43200.0)])
-    return value
+    is_known = np.isfinite(value)
+    if clocks not in (0, is_known.sum()):
+        raise InputError(f"{path}: {format_name(name)}", Unquoted("times beside numbers"), "times or numbers")
+    if clocks:
+        known = value[is_known] - value[is_known][0]
+        # A clock without a date begins anew at midnight.
+        value[is_known] = known + 86400.0 * np.concatenate([[0.0], np.cumsum(np.diff(known) < -43200.0)])
+    return value, clocks > 0
 
 
 def _convert_clock(date: str | None, hour: str, minute: str, second: str) -> float:

@@ -156,8 +156,15 @@ def test_gaps_clocks_and_notes_beside_the_numbers_are_read(tmp_path):
     time, value = (column.value for column in read_instrument_file(tmp_path / "a.csv").columns)
     np.testing.assert_allclose(time, [0.0, 0.5, 1.0, *np.arange(1.5, 9.0)])
     assert np.isnan(value[1:3]).all()
-    (tmp_path / "b.csv").write_text("Source,CH1,0.0,1.5\nLength,3,0.1,1.6\n,,0.2,1.7\n,,0.3,1.8\n")
-    assert [column.value.tolist() for column in read_instrument_file(tmp_path / "b.csv").columns][-1][-1] == 1.8
+    rows = ["Record Length,2500,Points,0.0,", "Interval,0.001,s,0.1,1.6", "Source,CH1,,0.2,1.7"]
+    (tmp_path / "b.csv").write_text("\n".join([*rows, *(f",,,0.{at},1.{at}" for at in range(3, 9))]))
+    file = read_instrument_file(tmp_path / "b.csv")
+    assert [column.name for column in file.columns] == ["column 4", "column 5"]
+    # A first sample that is missing leaves the column in place, and what is not read is named.
+    np.testing.assert_equal(file.columns[1].value[:3], [np.nan, 1.6, 1.7])
+    assert file.notes[2:] == tuple(f"'column {at}' not read: text" for at in (1, 2, 3))
+    (tmp_path / "c.csv").write_text("clock,b\n23:59:59,1\n,2\n00:00:01,3\n")
+    np.testing.assert_equal(read_instrument_file(tmp_path / "c.csv").columns[0].value, [0.0, np.nan, 2.0])
 
 
 @pytest.mark.parametrize(
@@ -173,6 +180,7 @@ def test_gaps_clocks_and_notes_beside_the_numbers_are_read(tmp_path):
         ({"time": ""}, ("no times of 'height'", "column or rate_hz")),
         ({"time": 'column = "time"\nrate_hz = 5.0'}, ("rate_hz: got 5.0", "not both")),
         ({"gate": GATE.replace("2.5", "9.5")}, ("gate.threshold: got 9.5", "between 0 and 5")),
+        ({"gate": GATE.replace('"gate"', '"time"').replace("2.5", "50")}, ("a pulse at the end of 'time'",)),
         ({"gate": GATE, "run": 'pulses = "p.csv"'}, ("[gate] beside pulses",)),
         ({"run": "ambient_c = 22.0"}, ("runs.first.ambient_c", "ambient_k")),
     ],
@@ -192,6 +200,7 @@ def test_what_stays_ambiguous_is_refused_in_one_line(tmp_path, values, words):
         ("a;b\n1,5;2.5\n3,5;4.5\n", ("'2.5' and '1,5'", "not both")),
         ("a,b\n1,2\n3,4\n5\n6,7\n", ("line 4", "1 cells", "2")),
         ("a,b\n1,2\n3,word\n5,6\n", ("b, row 2 of the numbers", "'word'")),
+        ("a,b\n10:00:00,2\n5,3\n", ("a: got times beside numbers",)),
         ("only words\nand more\n", ("no rows of numbers",)),
         ("", ("no rows of numbers",)),
     ],
