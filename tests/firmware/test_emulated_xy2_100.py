@@ -58,7 +58,8 @@ def test_each_10_us_have_a_frame_with_the_position_of_the_points_even_when_the_c
     check_places(core, points)
     arrived_us = np.array([at_us for at_us, *_ in core.mirrors])
     late_us = arrived_us[1:] - core.moves_us[-len(points) :]
-    assert FRAME_US < late_us.min() < late_us.max() < 2 * FRAME_US
+    # A frame's last bit is read 9.75 µs after the frame begins. Its position is fetched 0.25 µs before or less.
+    assert FRAME_US - 0.5 < late_us.min() < late_us.max() < 2 * FRAME_US
     on_us, off_us = (np.array([at_us for at_us, is_on, _ in core.pins if is_on == on]) for on in (True, False))
     assert (arrived_us[1:] < on_us).all()
     assert (off_us[:-1] < arrived_us[2:] - FRAME_US).all(), "no frame of the next place begins in a pulse"
