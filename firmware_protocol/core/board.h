@@ -66,6 +66,7 @@ struct board_hal {
     void (*feed_watchdog)(void *context);
     void (*hold_tick)(void *context, bool hold); /* NULL if board_receive is never interrupted by board_tick */
     void (*trace)(void *context, const struct board_trace *event); /* may be NULL */
+    bool has_exact_widths; /* at the output every pulse lasts its on_us, to within 2 µs */
 };
 
 #define LIMIT_MEMBER(name, bits, at, way) uint##bits##_t name;

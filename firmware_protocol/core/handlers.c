@@ -8,6 +8,7 @@
 #define INDEX_MAX UINT32_MAX
 #define CAPABILITY_KEY_EDGE 1u
 #define CAPABILITY_XY2_100 2u
+#define CAPABILITY_EXACT_WIDTHS 4u
 #define MS 1000u
 
 static bool inputs_safe(const struct board *b) { return find_unsafe_inputs(b->inputs) == 0 && is_head_ready(b); }
@@ -45,7 +46,8 @@ void on_hello(struct board *b, const struct frame *frame) {
     put_u32(body + HELLO_REPLY_FIRMWARE_AT, b->config.firmware);
     memcpy(body + HELLO_REPLY_UID_AT, b->config.uid, sizeof b->config.uid);
     put_u32(body + HELLO_REPLY_CAPABILITIES_AT, (b->config.key_edge ? CAPABILITY_KEY_EDGE : 0) |
-                                                    (b->config.interface == INTERFACE_XY2_100 ? CAPABILITY_XY2_100 : 0));
+                                                    (b->config.interface == INTERFACE_XY2_100 ? CAPABILITY_XY2_100 : 0) |
+                                                    (b->hal.has_exact_widths ? CAPABILITY_EXACT_WIDTHS : 0));
     put_u32(body + HELLO_REPLY_TICK_HZ_AT, TICK_HZ);
     put_u16(body + HELLO_REPLY_QUEUE_POINTS_AT, b->config.queue_points);
     put_u16(body + HELLO_REPLY_RX_WINDOW_AT, RX_WINDOW);

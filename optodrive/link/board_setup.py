@@ -75,7 +75,7 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
 
     margin_codes: DAC codes by which the permitted range extends beyond the outermost pixels
     """
-    (scale,) = build_scales(config)
+    (scale,), laser = build_scales(config), config.laser
     layout = build_aim_layout(config)
     angles_rad = load_scan_field(config).angles_rad(layout.x_m, layout.y_m)
     codes = np.stack(scale.to_outputs(*(scale.to_codes(angle_rad) for angle_rad in angles_rad)))
@@ -93,9 +93,11 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
             bandwidth_hz=config.scanner.bandwidth_hz,
             slew_rad_per_s=config.scanner.slew_rad_per_s,
             pulse_width_max_s=config.limits.pulse_width_max_s,
-            full_power_w=find_proportional_power_w(config.laser.max_power_w, config.laser.curve),
+            full_power_w=find_proportional_power_w(laser.max_power_w, laser.curve),
             pulse_energy_max_j=config.limits.pulse_energy_max_j,
             pixel_mean_power_max_w=config.limits.pixel_mean_power_max_w,
+            modulation=laser.modulation,
+            whole_periods=laser.whole_periods,
         ),
     )
 

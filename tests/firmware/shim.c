@@ -108,6 +108,7 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
                                 .set_gate = set_gate,
                                 .read_gate = read_gate,
                                 .move_mirrors = move_mirrors,
+                                .has_exact_widths = true,
                                 .read_inputs = read_inputs,
                                 .read_head = read_head,
                                 .read_triggers = read_triggers,

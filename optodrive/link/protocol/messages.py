@@ -40,7 +40,7 @@ NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
 """NAK reasons after which the host resends the same frame. Any other reason consumes the frame's sequence number."""
 EVENT_REASONS = tuple(EventReason)
 INPUTS = ("interlock", "key", "estop")
-CAPABILITY_KEY_EDGE, CAPABILITY_XY2_100 = 1, 2
+CAPABILITY_KEY_EDGE, CAPABILITY_XY2_100, CAPABILITY_EXACT_WIDTHS = 1, 2, 4
 HEAD_BITS = {0x8000: "power", 0x4000: "temperature"}
 """Bits of a ready scan head's status, and what is in order then."""
 

@@ -83,6 +83,8 @@ class ConfiguredValues:
     full_power_w: float
     pulse_energy_max_j: float
     pixel_mean_power_max_w: float
+    modulation: str
+    whole_periods: bool
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,12 @@ class BoardRequirements:
         if interface != self.interface:
             expected = f"{interface}, as this board's firmware has it (by `optodrive board build`)"
             raise InputError("scanner.interface", self.interface, expected, "board")
+        if not peer.capabilities & m.CAPABILITY_EXACT_WIDTHS:
+            own = "this board's firmware does not keep pulses to the microsecond (by `optodrive board build`)"
+            if values.modulation == "on_off":
+                raise InputError("laser.modulation", values.modulation, f"'pwm': {own}", "board")
+            if not values.whole_periods:
+                raise InputError("laser.whole_periods", values.whole_periods, f"True: {own}", "board")
         if peer.tick_hz != TICK_HZ:
             raise InputError("board tick_hz", peer.tick_hz, f"{TICK_HZ}", "board")
         limits, requested = peer.limits, self.limits

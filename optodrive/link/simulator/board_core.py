@@ -245,7 +245,9 @@ class BoardCore:
                 session=session,
                 firmware=FIRMWARE,
                 uid=bytes.fromhex(self._settings.uid),
-                capabilities=m.CAPABILITY_KEY_EDGE * self._settings.key_edge + m.CAPABILITY_XY2_100 * self._is_digital,
+                capabilities=m.CAPABILITY_EXACT_WIDTHS
+                + m.CAPABILITY_KEY_EDGE * self._settings.key_edge
+                + m.CAPABILITY_XY2_100 * self._is_digital,
                 tick_hz=TICK_HZ,
                 queue_points=self._settings.queue_points,
                 rx_window=WINDOW,

@@ -240,16 +240,45 @@ def test_the_full_power_of_a_curve_is_what_the_board_must_count_with():
     assert limits.spot_leak_uw == pytest.approx(plain.spot_leak_uw * 3.0 / 2.45, abs=1)
 
 
+FITS = m.HelloReply(
+    major=1,
+    minor=9,
+    host_nonce=0,
+    session=1,
+    firmware=0,
+    uid=bytes(12),
+    capabilities=0,
+    tick_hz=1_000_000,
+    queue_points=99,
+    rx_window=8,
+    cell_codes=1,
+    cells=16,
+    window_pulses=1,
+    reset_cause=0,
+    limits=DEFAULT_LIMITS,
+)
+
+
 @pytest.mark.parametrize(("field", "value"), [("major", 2), ("tick_hz", 999)])
 def test_another_protocol_or_tick_is_rejected(field, value):
     requirements = build_board_requirements(CONFIG)
-    fits = dict(major=1, minor=9, host_nonce=0, session=1, firmware=0, uid=bytes(12), capabilities=0, tick_hz=1_000_000)
-    fits |= dict(
-        queue_points=99, rx_window=8, cell_codes=1, cells=16, window_pulses=1, reset_cause=0, limits=DEFAULT_LIMITS
-    )
-    requirements.check_board(m.HelloReply(**fits))
+    requirements.check_board(FITS)
     with pytest.raises(InputError, match=f"{value}"):
-        requirements.check_board(m.HelloReply(**{**fits, field: value}))
+        requirements.check_board(replace(FITS, **{field: value}))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("modulation", "on_off", r"laser\.modulation: got 'on_off', expected 'pwm': this board's firmware does not"),
+        ("whole_periods", False, r"laser\.whole_periods: got False, expected True: this board's firmware does not"),
+    ],
+)
+def test_widths_in_microseconds_are_refused_for_a_board_that_does_not_promise_them(key, value, message):
+    config = changed("laser", **{key: value})
+    with pytest.raises(InputError, match=message):
+        build_board_requirements(config).check_board(FITS)
+    Rig(config=config).connect()
 
 
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
