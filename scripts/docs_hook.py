@@ -11,7 +11,7 @@ from named_code import find_missing
 ROOT = Path(__file__).resolve().parent.parent
 PROTOCOL_FOLDER = "firmware_protocol"
 PROTOCOL_PAGES = ("PROTOCOL.md", "SENSOR.md")
-PAGES_OUTSIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+PAGES_OUTSIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")
 DECISION_WORDS_MAX = 150
 """Words of a decision, its title and date apart."""
 CHANGELOG_LINES_MAX = 60

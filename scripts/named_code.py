@@ -11,6 +11,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 NAMED = re.compile(r"`([\w/]+\.(?:py|c)):([\w.]+)`")
 NAMED_TEST = re.compile(r"`(test_\w+(?:\.py)?)`")
+TEST_OF_FILE = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
 CODE = re.compile(r"`([^`\n]+)`|^(?: {4}|\$ )(.+)$", re.M)
 """Code within a sentence, and lines of commands."""
 PATH = re.compile(r"(?<![\w./-])(?:tests|scripts|optodrive|firmware_protocol|configs)/[\w./-]*[\w-]")
@@ -26,6 +27,7 @@ def find_missing(markdown: str, root: Path = ROOT) -> list[str]:
     """
     missing = [f"{file}:{name}" for file, name in NAMED.findall(markdown) if not _has(root, file, name)]
     missing += [name for name in NAMED_TEST.findall(markdown) if name not in _list_tests(root)]
+    missing += [f"{file}::{name}" for file, name in TEST_OF_FILE.findall(markdown) if not _has_test(root, file, name)]
     for span, line in CODE.findall(markdown):
         missing += _find_missing_in_command((span or line).partition("#")[0].strip(), root)
     return missing
@@ -58,6 +60,11 @@ def _list_tests(root: Path) -> set[str]:
     for path in (root / "tests").rglob("test_*.py"):
         names |= {path.name, *re.findall(r"def (test_\w+)\(", path.read_text(encoding="utf-8"))}
     return names
+
+
+def _has_test(root: Path, file: str, name: str) -> bool:
+    path = root / file
+    return path.is_file() and re.search(rf"\bdef {name}\(", path.read_text(encoding="utf-8")) is not None
 
 
 def _has(root: Path, file: str, name: str) -> bool:
