@@ -10,7 +10,7 @@ from async_reference import MODELS
 from optodrive.core.toml_model import Section
 from optodrive.daemon.api.app import build_app
 from optodrive.daemon.api.daemon_client import DaemonClient
-from optodrive.daemon.api.openapi import ERROR_RESPONSES
+from optodrive.daemon.api.openapi import BODY_SCHEMAS, ERROR_RESPONSES
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.device import config_sections
 from optodrive.device.config_file import load_config
@@ -23,7 +23,9 @@ Generated from the daemon's [OpenAPI document](openapi.json), which the daemon s
 except `/v1/health` needs `Authorization: Bearer TOKEN`. Below each stand the lowest role that may call it and, after an
 arrow, what it answers with 200.
 [frames.json](formats/frames-json.md) describes the body of a push, [streaming](../how-to/stream-frames.md) the
-WebSocket, [the client](../how-to/use-the-python-client.md) the use from Python.
+WebSocket, [the client](../how-to/use-the-python-client.md) the use from Python. Of other languages, programs such as
+openapi-typescript generate a client from the document, which the package has too
+(`_shipped/docs/reference/openapi.json`, beside `asyncapi.json`).
 
 Errors are problem documents (RFC 9457) with a stable `code`. A query or body with a name that the route does not read
 is refused with the nearest known name. Only STOP is never refused for that.
@@ -88,6 +90,7 @@ def build_rest_reference():
     routes = "".join(sections)
     outer = {model.__name__ for model in MODELS} | {name for name in schemas if f"(#{name.lower()})" in routes}
     inner = {name for each in outer for name in schemas if f'/{name}"' in json.dumps(schemas[each])}
+    elsewhere |= {name: "formats/frames-json.md" for name in BODY_SCHEMAS if name not in outer}
     elsewhere |= {name: "openapi.json" for name in schemas if name not in outer | inner | set(elsewhere)}
     sections += [
         format_model(name, schema, elsewhere, name not in outer)
@@ -236,10 +239,10 @@ def format_type(schema, elsewhere=MappingProxyType({})):
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         return f"[{name}]({elsewhere.get(name, f'#{name.lower()}')})"
-    if "anyOf" in schema:
-        kinds = [format_type(item, elsewhere) for item in schema["anyOf"] if item.get("type") != "null"]
+    if choices := schema.get("anyOf") or schema.get("oneOf"):
+        kinds = [format_type(item, elsewhere) for item in choices if item.get("type") != "null"]
         text = " or ".join(kinds)
-        return f"({text})" if len(kinds) < len(schema["anyOf"]) else text
+        return f"({text})" if len(kinds) < len(choices) else text
     if "enum" in schema or "const" in schema:
         return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
     if schema.get("type") == "array":

@@ -26,6 +26,7 @@ from optodrive.daemon.api.openapi import (
     EVENT_RESPONSES,
     PATTERN_NAME_EXAMPLES,
     SEQUENCE_EXAMPLE,
+    TAGS,
     build_request_body,
     extend_openapi,
 )
@@ -44,7 +45,10 @@ from optodrive.link.service.status import NO_EPOCH
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
 from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern
 
-PlanId = Annotated[str, Path(max_length=40)]
+PlanId = Annotated[str, Path(max_length=40, description="id of the plan, as the answer to its push states it")]
+PatternName = Annotated[
+    str, Path(max_length=80, description="name of the pattern", json_schema_extra=PATTERN_NAME_EXAMPLES)
+]
 DryRunQuery = Annotated[bool, Query(description="plan and limit only; nothing moves")]
 NewestQuery = Annotated[bool, Query(description="replace everything that is not yet committed to the board")]
 NameQuery = Annotated[
@@ -68,6 +72,8 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     app = FastAPI(
         generate_unique_id_function=lambda route: route.name,
         title="optodrive",
+        summary="REST API of a tactile display driven by projected light",
+        openapi_tags=TAGS,
         version=__version__,
         responses=ERROR_RESPONSES,
         openapi_url=None,
@@ -235,7 +241,7 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         openapi_extra=build_request_body("PatternParameters", "the pattern's parameters", {}, False),
     )
     async def play_pattern(
-        name: Annotated[str, Path(max_length=80, json_schema_extra=PATTERN_NAME_EXAMPLES)],
+        name: PatternName,
         request: Request,
         options: PushOptionsQuery,
         dry_run: DryRunQuery = False,

@@ -12,7 +12,7 @@ from optodrive.daemon.api.route_table import RouteTable
 from optodrive.daemon.responses.messages import FingersMessage, FingersRefusal, FrameResult, HoldReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
 from optodrive.daemon.responses.telemetry import EVENTS
-from optodrive.planning.stimuli.frame_json import ID_MAX, TARGET_KEYS
+from optodrive.planning.stimuli.frame_json import ID_MAX
 from optodrive.planning.stimuli.json_values import KEY_MAX, LABELS_MAX, NUMBER_MAX, PRIORITY_MAX, TEXT_MAX, TIME_MAX_S
 from optodrive.planning.stimuli.pattern_registry import PATTERNS
 from optodrive.planning.stimuli.sequence_file import FRAMES_MAX, TRAINS_MAX
@@ -41,26 +41,45 @@ _PRIORITY_SCHEMA: Schema = {
 }
 
 
+REF_TEMPLATE = "#/components/schemas/{model}"
+
+
+def _refer(name: str, text: str = "") -> Schema:
+    """Refer to a schema by its name.
+
+    text: description of the member that has it
+    """
+    reference: Schema = {"$ref": REF_TEMPLATE.format(model=name)}
+    return {**reference, "description": text} if text else reference
+
+
 def _by_pixel_schema(value: Schema, text: str) -> Schema:
+    """Return the schema of values by pixel."""
+    keys = {"pattern": "^(0|[1-9][0-9]*)$"}
+    return {"type": "object", "additionalProperties": value, "propertyNames": keys, "description": text}
+
+
+_INTENSITY_SCHEMA: Schema = {"type": "number", "minimum": 0, "description": "in thresholds"}
+_HEIGHTS_SCHEMA = _by_pixel_schema(_HEIGHT_SCHEMA, "Heights in µm by the index of the pixel.")
+_INTENSITIES_SCHEMA = _by_pixel_schema(
+    _INTENSITY_SCHEMA, "Perceived intensities in thresholds by the index of the pixel."
+)
+
+
+def _per_pixel_schema(by_pixel: Schema, value: Schema, text: str) -> Schema:
     """Return the schema of values by pixel, or of one per pixel."""
-    by_pixel = {"type": "object", "additionalProperties": value, "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"}}
     return {"oneOf": [by_pixel, {"type": "array", "items": value}], "description": text}
 
 
-_TARGETS_SCHEMA = _by_pixel_schema(_HEIGHT_SCHEMA, "heights by pixel, or one height per pixel")
-_INTENSITIES_SCHEMA = _by_pixel_schema(
-    {"type": "number", "minimum": 0, "description": "in thresholds"},
-    "perceived intensities by pixel, or one per pixel, in place of target_um",
-)
+_TARGETS_TEXT = "heights by pixel, or one height per pixel"
 
 
 def _described(schema: Schema, text: str) -> Schema:
     return {**schema, "description": text}
 
 
-_ONE_TARGET: list[Schema] = [{"required": [key]} for key in TARGET_KEYS]
 LIVE_FRAME_SCHEMA = _object_schema(
-    {"target_um": _TARGETS_SCHEMA},
+    {"target_um": _per_pixel_schema(_HEIGHTS_SCHEMA, _HEIGHT_SCHEMA, _TARGETS_TEXT)},
     {
         "frame": {
             "type": "integer",
@@ -71,19 +90,25 @@ LIVE_FRAME_SCHEMA = _object_schema(
     },
 )
 """The schema of a streamed frame as text."""
-_FRAME_SCHEMA = _object_schema(
-    {
+
+
+def _frame_schema(text: str, **target: Schema) -> Schema:
+    """Return the schema of a frame.
+
+    target: the member that states what it raises
+    """
+    times = {
         "show_at_s": _described(_START_SCHEMA, "time at which the frame begins, from the zero of the sequence, s"),
         "duration_s": _described(_DURATION_SCHEMA, "time within which all its pixels are raised, s"),
-    },
-    {
-        "target_um": _TARGETS_SCHEMA,
-        "intensity": _INTENSITIES_SCHEMA,
+    }
+    optional: dict[str, Schema] = {
         "id": {"type": "string", "minLength": 1, "maxLength": ID_MAX, "description": "name of the frame in reports"},
         "simultaneous": {"type": "boolean", "description": "raise all pixels within one relaxation time"},
         "priority": _PRIORITY_SCHEMA,
-    },
-) | {"oneOf": _ONE_TARGET}
+    }
+    return {**_object_schema({**times, **target}, optional), "description": text}
+
+
 _TRAIN_SCHEMAS: dict[str, Schema] = {
     "pixel": {"type": "integer", "minimum": 0, "description": "index of the pixel"},
     "start_s": _described(_START_SCHEMA, "time of the first pulse from the zero of the sequence, s"),
@@ -114,24 +139,6 @@ _INTENSITY_TRAIN_SCHEMA = _object_schema(
     {**_TRAIN_SCHEMAS, "period_s": _PERIOD_SCHEMA, "intensity": {**_POSITIVE_SCHEMA, "description": "in thresholds"}},
     {"priority": _PRIORITY_SCHEMA},
 )
-_FRAMES_SCHEMA: Schema = {
-    "type": "array",
-    "items": {"title": "Frame", **_FRAME_SCHEMA},
-    "maxItems": FRAMES_MAX,
-    "description": "frames in order of time",
-}
-_TRAINS_SCHEMA: Schema = {
-    "type": "array",
-    "items": {
-        "oneOf": [
-            {"title": "PulseTrain", **_PULSE_TRAIN_SCHEMA},
-            {"title": "HeightTrain", **_HEIGHT_TRAIN_SCHEMA},
-            {"title": "IntensityTrain", **_INTENSITY_TRAIN_SCHEMA},
-        ]
-    },
-    "maxItems": TRAINS_MAX,
-    "description": "trains of pulses, of different pixels or times",
-}
 _LABELS_SCHEMA: Schema = {
     "type": "object",
     "maxProperties": LABELS_MAX,
@@ -143,14 +150,33 @@ _LABELS_SCHEMA: Schema = {
             {"type": "boolean"},
         ]
     },
-    "description": "recorded with the plan and never interpreted",
+    "description": "Names and values that are recorded with a plan and never interpreted.",
 }
+_FRAMES = ("HeightFrame", "IntensityFrame")
+_TRAINS = ("PulseTrain", "HeightTrain", "IntensityTrain")
+
+
+def _list_schema(names: tuple[str, ...], max_items: int, text: str) -> Schema:
+    return {
+        "type": "array",
+        "items": {"oneOf": [_refer(name) for name in names]},
+        "maxItems": max_items,
+        "description": text,
+    }
+
+
 SEQUENCE_SCHEMA: Schema = {
-    **_object_schema({}, {"frames": _FRAMES_SCHEMA, "trains": _TRAINS_SCHEMA, "labels": _LABELS_SCHEMA}),
-    "anyOf": [
-        {"required": ["frames"], "properties": {"frames": {"minItems": 1}}},
-        {"required": ["trains"], "properties": {"trains": {"minItems": 1}}},
-    ],
+    **_object_schema(
+        {},
+        {
+            "frames": _list_schema(_FRAMES, FRAMES_MAX, "frames in order of time"),
+            "trains": _list_schema(_TRAINS, TRAINS_MAX, "trains of pulses, of different pixels or times"),
+            "labels": _refer("Labels", "recorded with the plan and never interpreted"),
+        },
+    ),
+    # Not `anyOf`: programs that generate clients make a nameless model of each of its choices.
+    "not": {"properties": {"frames": {"maxItems": 0}, "trains": {"maxItems": 0}}},
+    "description": "FRAMES.json: at least one frame or train.",
 }
 """The schema of FRAMES.json."""
 SEQUENCE_EXAMPLE: Schema = {
@@ -168,12 +194,40 @@ SEQUENCE_EXAMPLE: Schema = {
 PATTERN_NAME_EXAMPLES: Schema = {"examples": list(PATTERNS)}
 PARAMETERS_SCHEMA: Schema = {
     "type": "object",
-    "properties": {"labels": _LABELS_SCHEMA},
+    "properties": {"labels": _refer("Labels", "recorded with the plan and never interpreted")},
     "additionalProperties": {"type": ["number", "string", "boolean"]},
-    "description": "as listed by GET /v1/patterns; a file in base64",
+    "description": "Values by name, as GET /v1/patterns lists the names; a file in base64.",
 }
-BODY_SCHEMAS = {"FrameSequence": SEQUENCE_SCHEMA, "PatternParameters": PARAMETERS_SCHEMA, "DimRequest": DIM_SCHEMA}
-"""The schemas of all bodies by their names in the OpenAPI document."""
+BODY_SCHEMAS: dict[str, Schema] = {
+    "FrameSequence": SEQUENCE_SCHEMA,
+    "HeightFrame": _frame_schema(
+        "Heights within a time.",
+        target_um=_per_pixel_schema(_refer("HeightByPixel"), _HEIGHT_SCHEMA, _TARGETS_TEXT),
+    ),
+    "IntensityFrame": _frame_schema(
+        "Perceived intensities within a time.",
+        intensity=_per_pixel_schema(
+            _refer("IntensityByPixel"), _INTENSITY_SCHEMA, "perceived intensities by pixel, or one per pixel"
+        ),
+    ),
+    "HeightByPixel": _HEIGHTS_SCHEMA,
+    "IntensityByPixel": _INTENSITIES_SCHEMA,
+    "PulseTrain": _described(_PULSE_TRAIN_SCHEMA, "Equal pulses of one pixel, by width and power."),
+    "HeightTrain": _described(_HEIGHT_TRAIN_SCHEMA, "Pulses of one pixel that reach one height."),
+    "IntensityTrain": _described(_INTENSITY_TRAIN_SCHEMA, "Pulses of one pixel that reach one perceived intensity."),
+    "Labels": _LABELS_SCHEMA,
+    "PatternParameters": PARAMETERS_SCHEMA,
+    "DimRequest": DIM_SCHEMA,
+}
+"""The schemas of all bodies and their parts by their names in the OpenAPI document."""
+TAGS = [
+    {"name": "state", "description": "What board, link, queue and planner do, and the effective configuration."},
+    {"name": "board", "description": "Arm, disarm, pause, dim and stop the board."},
+    {"name": "service", "description": "The daemon itself."},
+    {"name": "plans", "description": "Push frames and trains, read what became of them, and cancel them."},
+    {"name": "patterns", "description": "Named stimuli and their parameters."},
+]
+"""What the routes of a tag are for."""
 
 
 def build_request_body(name: str, description: str, example: Schema, required: bool) -> Schema:
@@ -181,19 +235,12 @@ def build_request_body(name: str, description: str, example: Schema, required: b
 
     name: of one of `BODY_SCHEMAS`
     """
-    content = {"application/json": {"schema": {"$ref": f"#/components/schemas/{name}"}, "example": example}}
+    content = {"application/json": {"schema": _refer(name), "example": example}}
     return {"requestBody": {"description": description, "required": required, "content": content}}
 
 
-REF_TEMPLATE = "#/components/schemas/{model}"
-
-
-def _refer_to(model: type) -> dict[str, str]:
-    return {"$ref": REF_TEMPLATE.format(model=model.__name__)}
-
-
 ERROR_RESPONSES: dict[int | str, dict[str, Any]] = {
-    status: {"description": text, "content": {MEDIA_TYPE: {"schema": _refer_to(Problem)}}}
+    status: {"description": text, "content": {MEDIA_TYPE: {"schema": _refer(Problem.__name__)}}}
     for status, text in {
         401: "no token, or a wrong one",
         403: "the Origin is not allowed, or the token's role is insufficient",
@@ -227,7 +274,7 @@ EVENT_RESPONSES: dict[int | str, dict[str, Any]] = {
                         },
                     },
                     "oneOf": [
-                        {"properties": {"event": {"const": event}, "data": {"contentSchema": _refer_to(model)}}}
+                        {"properties": {"event": {"const": event}, "data": {"contentSchema": _refer(model.__name__)}}}
                         for event, model in EVENTS.items()
                     ],
                 }

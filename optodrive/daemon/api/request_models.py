@@ -17,6 +17,7 @@ DIM_SCHEMA: dict[str, Any] = {
     "type": "object",
     "required": ["share"],
     "additionalProperties": False,
+    "description": "The largest power of a pulse from now on.",
     "properties": {"share": {"type": "number", "minimum": 0, "maximum": 1, "description": "of full power"}},
 }
 DIM_EXAMPLE = {"share": 0.4}

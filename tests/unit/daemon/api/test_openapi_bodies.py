@@ -4,11 +4,11 @@ import jsonschema_rs
 import pytest
 
 from displays import DISPLAYS
-from optodrive.daemon.api.openapi import SEQUENCE_EXAMPLE, SEQUENCE_SCHEMA
+from optodrive.daemon.api.openapi import BODY_SCHEMAS, SEQUENCE_EXAMPLE
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 
-SCHEMA = jsonschema_rs.validator_for(SEQUENCE_SCHEMA)
+SCHEMA = jsonschema_rs.validator_for({**BODY_SCHEMAS["FrameSequence"], "components": {"schemas": BODY_SCHEMAS}})
 
 
 @pytest.mark.parametrize("name", ["showcase", "experiment-1", "experiment-6", "text", "vibration"])
