@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import wave
 from pathlib import Path
 
 import h5py
@@ -157,6 +158,11 @@ def write_stimuli(folder):
         'stroke-width=".2"><path class="axes" d="M0 10H20M10 0V20"/>'
         '<path d="M1 18C7 18 13 2 19 2"/></svg>'
     )
+    tap = {"EventType": "HapticTransient", "EventParameters": [{"ParameterID": "HapticIntensity", "ParameterValue": 1}]}
+    (folder / "knock.ahap").write_text(json.dumps({"Version": 1.0, "Pattern": [{"Event": tap}]}))
+    with wave.open(str(folder / "voice.wav"), "wb") as file:
+        file.setparams((1, 2, 8000, 0, "NONE", ""))
+        file.writeframes((np.sin(np.arange(1600)) * 9000).astype("<i2").tobytes())
 
 
 def write_recordings(folder):

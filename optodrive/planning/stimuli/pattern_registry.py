@@ -16,6 +16,8 @@ from optodrive.planning.stimuli import experiments, images, shapes
 from optodrive.planning.stimuli.braille_files import build_braille_file
 from optodrive.planning.stimuli.drawings import build_drawing
 from optodrive.planning.stimuli.experiments import build_comparison
+from optodrive.planning.stimuli.imports.haptic_files import build_haptic_file
+from optodrive.planning.stimuli.imports.sound import build_sound
 from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
 from optodrive.planning.stimuli.sequence_file import (
@@ -33,6 +35,9 @@ _CENTRE_PARAMETER = PatternParameter(
 _SECONDS_PARAMETER = PatternParameter("seconds", "number", 1.0, "minimum duration", "s", min=0.0, max=600.0)
 _INTENSITY_PARAMETER = PatternParameter(
     "intensity", "number", None, "perceived intensity in thresholds, in place of height_um", min=0.01, max=1000.0
+)
+_PIXELS_PARAMETER = PatternParameter(
+    "pixels", "text", None, "pixels that rise together, such as 200,201 or 200-205; the middle by default"
 )
 _FILE_PARAMETER = PatternParameter("file", "file", None, "image file: PNG, JPEG or GIF", required=True)
 _INVERT_PARAMETER = PatternParameter("invert", "flag", False, "raise dark areas instead of bright ones")
@@ -309,6 +314,33 @@ _PATTERN_LIST = (
         images.build_animation,
     ),
     Pattern(
+        "haptic-file",
+        "taps and vibrations of a haptic file: .haptic, AHAP or .hjif",
+        (
+            PatternParameter("file", "file", None, ".haptic, AHAP or .hjif file", required=True),
+            _PIXELS_PARAMETER,
+            _height_parameter(100.0, "height of strength 1"),
+            PatternParameter("low_hz", "number", 25.0, "rate of frequency or sharpness 0", "Hz", min=1.0, max=200.0),
+            PatternParameter("high_hz", "number", 100.0, "rate of frequency or sharpness 1", "Hz", min=1.0, max=200.0),
+            PatternParameter("channel", "integer", None, "channel of a .hjif file with several", min=1, max=65_536),
+            PatternParameter("lossy", "flag", False, "leave out what a membrane cannot show, instead of refusing it"),
+        ),
+        build_haptic_file,
+        "One pulse per cycle and pixel, of the envelope's height. Frequencies of a .hjif file are in Hz, up to 200.",
+    ),
+    Pattern(
+        "sound",
+        "pulses as high as a sound is loud",
+        (
+            PatternParameter("file", "file", None, "WAV file", required=True),
+            _PIXELS_PARAMETER,
+            _height_parameter(100.0, "height of the loudest cycle"),
+            PatternParameter("rate_hz", "number", 50.0, "pulses per second", "Hz", min=1.0, max=200.0),
+        ),
+        build_sound,
+        "The height of a pulse is the root mean square of its cycle, over all channels.",
+    ),
+    Pattern(
         "scope",
         "a waveform on the converter's outputs for an oscilloscope, with weak pulses of 1 ms",
         (
@@ -392,7 +424,7 @@ def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
     A value may be text, as from a command line; a file is its bytes, or these in base64.
 
     Raises InputError: unknown_pattern, unknown_parameter, missing_parameter, bad_parameter, unknown_pixel,
-    does_not_fit, bad_text, bad_picture, too_many, bad_train, raises_nothing.
+    does_not_fit, bad_text, bad_picture, bad_haptic, bad_sound, not_shown, too_many, bad_train, raises_nothing.
     """
     pattern, where = find_pattern(name), f"pattern {name}"
     arguments = pattern.resolve_arguments(given, config)

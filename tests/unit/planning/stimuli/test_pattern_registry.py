@@ -27,11 +27,18 @@ def picture():
     return buffer.getvalue()
 
 
+TAP = (
+    b'{"Version": 1, "Pattern": [{"Event": {"Time": 0, "EventType": "HapticTransient", "EventParameters": '
+    b'[{"ParameterID": "HapticIntensity", "ParameterValue": 1}]}}]}'
+)
+CLICK = b"RIFF,\0\0\0WAVEfmt \x10\0\0\0\1\0\1\0@\x1f\0\0@\x1f\0\0\1\0\x08\0data\x08\0\0\0\xff\0\xff\0\xff\0\xff\0"
 NEEDED = {
     "text": {"text": "hello"},
     "image": {"file": picture()},
     "animation": {"file": picture()},
     "braille-file": {"file": b",HELLO"},
+    "haptic-file": {"file": TAP},
+    "sound": {"file": CLICK},
     "drawing": {
         "file": b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M0 0L9 9" stroke="red"/></svg>'
     },

@@ -1,0 +1,1 @@
+"""Stimuli from files of other fields: haptic effects and sound."""
