@@ -42,8 +42,10 @@ CEILING_SIGMAS = 4.0
 """σ below a ceiling that are left out too."""
 APPROACH = 0.02
 """Bands below a ceiling in which the last approach is timed, relative to the range."""
-SLOWING = 2.5
-"""Factor by which the approach may slow down."""
+TURN_STEPS = 4.0
+"""Steps of a converter below a ceiling over which rounding does not matter."""
+TURN = 5.0
+"""Time at a ceiling, relative to the time for these steps."""
 RISE = 0.5
 """Rise before it, relative to the range."""
 MIN_RISE = 4
@@ -183,25 +185,35 @@ def find_ceiling(t_s: FloatArray, value: FloatArray, may_be_smooth: bool) -> flo
 
 
 def _is_reached_fast(t_s: FloatArray, value: FloatArray, is_tie: BoolArray, quantum: float) -> bool:
-    """Return whether the longest row at the top is reached without slowing down."""
+    """Return whether the longest row at the top is reached without slowing down, and is longer than a turn there.
+
+    From 4 d to d below its end, a decay takes ln 4 τ, and on to the last half step at least ln 8 τ for d of 4 steps or
+    more; a parabola takes as long for both to its vertex, and less to a ceiling below it. A turn at constant
+    acceleration stays on the last step at most 4 times as long as on the step before.
+    """
     starts, lengths = _find_rows(is_tie.astype(np.float64))
     is_top = is_tie[starts]
     at = int(starts[is_top][np.argmax(lengths[is_top])])
     length = int(lengths[is_top].max())
-    top, range_ = float(value.max()), float(np.ptp(value))
-    band = max(APPROACH * range_, 4.0 * quantum)
-    before = value[:at]
-    if length < MIN_TIES or not len(before) or 2.0 * band > 0.5 * range_:
+    range_, dt_s = float(np.ptp(value)), float(np.median(np.diff(t_s)))
+    band = max(APPROACH * range_, TURN_STEPS * quantum)
+    if length < MIN_TIES or 4.0 * band > RISE * range_:
         return False
-    crossings = [np.flatnonzero(before < top - depth) for depth in (RISE * range_, 2.0 * band, band)]
-    if any(not len(rows) for rows in crossings):
+    crossings_s = [_find_crossing(t_s, value, at, depth) for depth in (RISE * range_, 4.0 * band, band)]
+    steps_s = _find_crossing(t_s, value, at, TURN_STEPS * quantum if quantum else band)
+    if np.isnan(crossings_s).any() or t_s[at] - crossings_s[0] < (MIN_RISE - 1) * dt_s:
         return False
-    first, second, last = (int(rows[-1]) for rows in crossings)
-    if at - first < MIN_RISE:
-        return False
-    dt_s = float(np.median(np.diff(t_s)))
-    slow_s, usual_s = float(t_s[at] - t_s[last]), float(t_s[last] - t_s[second])
-    return slow_s <= SLOWING * usual_s + 2.5 * dt_s and length * dt_s >= 5.0 * slow_s
+    usual_s, slow_s = crossings_s[2] - crossings_s[1], t_s[at] - crossings_s[2]  # late by a sample at most
+    return bool(slow_s <= usual_s + dt_s and length * dt_s >= TURN * (t_s[at] - steps_s))
+
+
+def _find_crossing(t_s: FloatArray, value: FloatArray, at: int, depth: float) -> float:
+    """Return the last time before a sample at which the signal was this far below it, s, or NaN."""
+    below = np.flatnonzero(value[:at] < value[at] - depth)
+    if not len(below):
+        return float("nan")
+    row = int(below[-1])
+    return float(np.interp(value[at] - depth, value[row : row + 2], t_s[row : row + 2]))
 
 
 def select_near_ceiling(value: FloatArray, ceiling: float, reach: float) -> BoolArray:

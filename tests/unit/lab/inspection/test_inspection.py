@@ -134,6 +134,8 @@ def test_a_glitch_that_repeats_share_is_no_outlier():
 
 @EXAMPLES
 @given(share=st.floats(0.5, 0.95), quantum=st.sampled_from([0.0, 1e-7, 1e-6]), noise=st.sampled_from([0.05, 1.0]))
+@example(share=0.94, quantum=1e-6, noise=0.05)
+@example(share=0.95, quantum=1e-6, noise=0.05)
 def test_a_ceiling_is_left_out_with_what_is_near(share, quantum, noise):
     clean = build_clean(5, 1000.0, noise)
     top = max(float(np.nanmax(run.signals[HEIGHT].value)) for run in clean.runs)
@@ -198,7 +200,8 @@ def test_a_slack_membrane_is_no_floor_of_its_sensor(share):
     assert "clipped" not in find(change(clean, HEIGHT, loosen))[0]
 
 
-def test_what_settles_is_no_ceiling():
+@pytest.mark.parametrize("tau_s", [0.004, 0.02])
+def test_what_settles_is_no_ceiling(tau_s):
     """Long pulses end in equal samples, exact or in steps of a converter; a settled membrane is none either."""
     runs = []
     for run in lab(1, {}, groups=("weak", "strong"), noise=0.0).runs:
@@ -212,7 +215,11 @@ def test_what_settles_is_no_ceiling():
                 * np.where(
                     t_s < 0.02,
                     0.0,
-                    np.where(t_s < 3.0, 1.0 - np.exp(-(t_s - 0.02) / 0.02), np.exp(-(t_s - 3.0) / 0.02)),
+                    np.where(
+                        t_s < 3.0,
+                        -np.expm1(-np.maximum(t_s - 0.02, 0.0) / tau_s),
+                        np.exp(-np.maximum(t_s - 3.0, 0.0) / tau_s),
+                    ),
                 ),
             )
             for name, scale in ((HEIGHT, 1e-4), (HEAT, 100.0))
@@ -221,7 +228,7 @@ def test_what_settles_is_no_ceiling():
         pulses = run.pulses.copy()
         pulses[0, :2] = 0.02, 2.98
         runs.append(replace(run, signals=signals, pulses=pulses))
-    for step_m in (0.0, 1e-7, 1e-6):
+    for step_m in (0.0, 1e-7, 1e-6, 2e-6):
         measurement = change(
             Measurement(tuple(runs)), HEIGHT, lambda _, value, q=step_m: q * np.round(value / q) if q else value
         )
