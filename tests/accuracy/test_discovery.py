@@ -27,8 +27,10 @@ from foreign_systems import (
 from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.lab.discovery import OdeModel, Parameter, Record, discover, discovery, search
-from optodrive.lab.discovery.fitting import Point, Simulation, Terms, estimate_noise, fit
+from optodrive.lab.discovery.discovery import DIFFERENCES, MIN_DIFFERENCES
+from optodrive.lab.discovery.fitting import Point, Simulation, Terms, fit
 from optodrive.lab.discovery.model import read_record
+from optodrive.lab.inference.noise import estimate_noise
 
 SILVERBOX = os.environ.get("SILVERBOX_CSV")
 SAMPLE_RATE_HZ = 610.35
@@ -99,7 +101,7 @@ def test_overflow_and_ceiling_of_two_tanks():
 def test_noise_is_estimated_beside_slow_and_fast_oscillations(samples_per_period):
     row = np.arange(3000)
     noisy = np.sin(2.0 * np.pi * row / samples_per_period) + 1e-3 * np.random.default_rng(2).standard_normal(3000)
-    assert estimate_noise([Record(0.01 * row, np.zeros((3000, 0)), noisy)]) == pytest.approx(1e-3, rel=0.1)
+    assert estimate_noise([noisy], DIFFERENCES, few=MIN_DIFFERENCES) == pytest.approx(1e-3, rel=0.1)
 
 
 def test_nothing_is_found_where_nothing_is_missing():

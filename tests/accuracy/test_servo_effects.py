@@ -16,11 +16,12 @@ from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.config_file import load_config
 from optodrive.lab.commissioning.mirror_steps import plan_step_runs, play_step_runs
+from optodrive.lab.inference.noise import estimate_noise
 from optodrive.lab.recording import write_recording
 from optodrive.lab.servo_identification.effect_fit import LINEAR, find_effect
 from optodrive.lab.servo_identification.gate import move_sizes_rad
 from optodrive.lab.servo_identification.identify import identify
-from optodrive.lab.servo_identification.records import estimate_noise, extract_records, extract_trace
+from optodrive.lab.servo_identification.records import DIFFERENCES, extract_records, extract_trace
 from optodrive.link.simulator.galvos import measure_position_outputs
 
 FORMS = ("multisine", "noise", "sweep", "holds")
@@ -57,7 +58,7 @@ def test_of_68_hidden_servos_at_most_one_gets_a_false_name():
 def test_noise_is_that_of_white_samples_on_a_smooth_response():
     random, t_s = np.random.default_rng(3), np.arange(5000) / 25.0
     value = np.sin(2.0 * np.pi * t_s) + 0.01 * random.standard_normal(5000)
-    assert estimate_noise(value) == pytest.approx(0.01, rel=0.05)
+    assert estimate_noise([value], DIFFERENCES) == pytest.approx(0.01, rel=0.05)
 
 
 def calibrate(folder, capsys, servo, name):

@@ -21,6 +21,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, SIGNALS
 from optodrive.lab.diagnosis.noise_model import estimate_resolution
+from optodrive.lab.inference.noise import estimate_noise
 from optodrive.lab.inspection.response_faults import compute_template, thin
 from optodrive.physics.pixel import Pixel
 
@@ -125,14 +126,8 @@ def _has_noise(signal: Signal) -> bool:
     finite = signal.value[np.isfinite(signal.value)]
     if len(finite) < MIN_SAMPLES or float(np.median(np.diff(signal.t_s))) > MAX_INTERVAL_S:
         return False
-    near, far = _estimate_noise_of_thirds(finite, 1), _estimate_noise_of_thirds(finite, 2)
+    near, far = (estimate_noise([finite], (3,), stride=stride) for stride in (1, 2))
     return near > MIN_NOISE * estimate_resolution(finite, float(np.ptp(finite))) and near > MIN_WHITENESS * far
-
-
-def _estimate_noise_of_thirds(value: FloatArray, stride: int) -> float:
-    """Return the standard deviation of white noise by third differences, which are small where a signal is smooth."""
-    differences = value[3 * stride :] - 3.0 * (value[2 * stride : -stride] - value[stride : -2 * stride])
-    return float(1.4826 * np.median(np.abs(differences - value[: -3 * stride])) / np.sqrt(20.0))
 
 
 class _TimeUnits(NamedTuple):
@@ -214,7 +209,7 @@ def _check_pixel_signal(
     if name in CHANGE_SIGNALS:
         median = float(np.median(value))
         change = max(float(value.max()) - median, median - float(value.min()))
-        if change > RECORDING[name].high + NOISE_SIGMAS * _estimate_noise(value):
+        if change > RECORDING[name].high + NOISE_SIGMAS * estimate_noise([value], (1,)):
             check_plausible(f"{where}/{name}", change, RECORDING[name])
     return ratio
 
@@ -245,7 +240,7 @@ def _check_temperature(where: str, run: Run, t_s: FloatArray, value: FloatArray)
     if float(np.median(value)) > RECORDING["absorber_temperature_K"].high:
         _refuse(where, f"{baseline:.6g} in the dark", "K", "mK")
     if baseline > run.ambient_k - AMBIENT_TOLERANCE_K:
-        coldest, hottest, noise = float(value.min()), float(value.max()), NOISE_SIGMAS * _estimate_noise(value)
+        coldest, hottest, noise = float(value.min()), float(value.max()), NOISE_SIGMAS * estimate_noise([value], (1,))
         if coldest < -noise or hottest > RECORDING["absorber_temperature_K"].high + noise:
             worst = coldest if coldest < -noise else hottest
             raise InputError(
@@ -291,11 +286,6 @@ def _check_sigma(where: str, signal: Signal, value: FloatArray, unit: str) -> No
     span = float(np.ptp(value))
     if signal.sigma is not None and len(value) >= 100 and 0.0 < 100.0 * span < signal.sigma:
         _refuse_size(where, f"{signal.sigma / span:.3g} times the span of the values", signal.sigma / span, unit)
-
-
-def _estimate_noise(value: FloatArray) -> float:
-    """Return the standard deviation of noise between neighbouring samples."""
-    return float(1.4826 * np.median(np.abs(np.diff(value))) / np.sqrt(2.0))
 
 
 def _refuse(where: str, observed: str, unit: str, likely: str) -> NoReturn:

@@ -17,7 +17,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
-from optodrive.lab.discovery.fitting import Point, Simulation, Terms, choose_step, estimate_noise, output_sizes
+from optodrive.lab.discovery.fitting import Point, Simulation, Terms, choose_step, output_sizes
 from optodrive.lab.discovery.forms import NAMELESS
 from optodrive.lab.discovery.held_out import (
     UNCOMPUTABLE,
@@ -36,7 +36,10 @@ from optodrive.lab.discovery.screening import (
 )
 from optodrive.lab.discovery.search import TIGHTNESS, TermSearch
 from optodrive.lab.inference.claim import MAX_NO_EFFECT, NOTHING_SHOWN, Claim, TermClaim, combine_claims
+from optodrive.lab.inference.noise import estimate_noise
 
+DIFFERENCES, MIN_DIFFERENCES = (4, 8, 12), 32
+"""Orders of differences by which noise is estimated, and how many of one order are needed beside a gap."""
 MAX_TERMS = 4
 MIN_ERROR = 1e-3
 """Error of a model, relative to the output, that the integration and the inputs' interpolation may cause."""
@@ -89,7 +92,9 @@ class _Discovery:
         self.is_white = all(record.whiten is not None for record in records)
         self.noise = np.ones(len(model.outputs))  # in its own units where records whiten their errors
         if not self.is_white:
-            self.noise = np.maximum(estimate_noise(records), 1e-4 * output_sizes(records))
+            columns = ([record.outputs[:, k] for record in records] for k in range(len(model.outputs)))
+            noise = [estimate_noise(parts, DIFFERENCES, few=MIN_DIFFERENCES) for parts in columns]
+            self.noise = np.maximum(noise, 1e-4 * output_sizes(records))
         self.judge = Judge(self.simulation, records, self.splits, self.noise)
         few = prepare_search(records, self.splits[0])
         self.search = TermSearch(self.simulation, few, self.noise, self.is_white)

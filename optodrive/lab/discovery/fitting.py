@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import comb, sqrt
 
 import numpy as np
 
@@ -23,8 +22,6 @@ TOLERANCE = 1e-7
 """Relative change of squares and point at which a fit ends."""
 CONVERGED = 1e-3
 """Change of a free run, relative to the outputs, at which the integration step is short enough."""
-DIFFERENCES, MIN_DIFFERENCES = (4, 8, 12), 32
-"""Orders of differences by which noise is estimated, and how many of one order are needed beside a gap."""
 LONGEST_FROM_REST = 8.0
 """First step tried between samples that are dense where light changes, in their median distance."""
 
@@ -302,24 +299,6 @@ def weigh(record: Record, errors: FloatArray, weights: FloatArray) -> FloatArray
         columns = np.where(measured, errors, 0.0)
         errors = record.whiten(columns.reshape(*record.outputs.shape, -1)).reshape(columns.shape)
     return errors * (weights if errors.ndim == 2 else weights[:, :, None])
-
-
-def estimate_noise(records: Sequence[Record]) -> FloatArray:
-    """Return an upper estimate of the noise of each output [o], the smallest from differences of some orders.
-
-    Those of order n vanish for a signal that is a polynomial of degree n − 1 over n + 1 samples: a high order for an
-    oscillation of few samples per period, a low one beside steps and gaps. Medians are robust against steps.
-    """
-    estimates = []
-    for column in range(records[0].outputs.shape[1]):
-        bounds = []
-        for order in DIFFERENCES:
-            differences = [np.diff(record.outputs[:, column], order) for record in records if len(record.t_s) > order]
-            joined = np.concatenate([d[np.isfinite(d)] for d in differences]) if differences else np.zeros(0)
-            if len(joined) >= MIN_DIFFERENCES:
-                bounds.append(1.4826 * float(np.median(np.abs(joined))) / sqrt(comb(2 * order, order)))
-        estimates.append(min(bounds, default=0.0))
-    return np.array(estimates)
 
 
 def output_sizes(records: Sequence[Record]) -> FloatArray:

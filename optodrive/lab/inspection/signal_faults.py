@@ -16,7 +16,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
+from optodrive.lab.inference.noise import estimate_noise
 
+THIRDS = (3,)
+"""Order of the differences by which noise is estimated."""
 MIN_QUANTA = 8
 """Smallest number of steps between levels by which a converter's step is found."""
 ROUNDING = 1e-6
@@ -99,14 +102,8 @@ def measure_noise(value: FloatArray) -> SampleNoise:
     """Return the noise of samples in order of time."""
     if len(value) < 16:
         return SampleNoise(0.0, False, 0.0)
-    near, far = (_estimate_sigma(value, stride) for stride in (1, 2))
+    near, far = (estimate_noise([value], THIRDS, stride=stride) for stride in (1, 2))
     return SampleNoise(near, near > 0.5 * far and near > 1e-9 * float(np.abs(value).max()), find_quantum(value, 1))
-
-
-def _estimate_sigma(value: FloatArray, stride: int) -> float:
-    """Return the standard deviation of white noise by third differences, which are small where a signal is smooth."""
-    differences = value[3 * stride :] - 3.0 * (value[2 * stride : -stride] - value[stride : -2 * stride])
-    return float(1.4826 * np.median(np.abs(differences - value[: -3 * stride])) / np.sqrt(20.0))
 
 
 def find_quantum(value: FloatArray, min_quanta: int = MIN_QUANTA) -> float:

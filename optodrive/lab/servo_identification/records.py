@@ -13,6 +13,7 @@ import numpy as np
 from optodrive.core.errors import MISSING, InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import Measurement, Run
+from optodrive.lab.inference.noise import estimate_noise
 from optodrive.lab.servo_identification.effect_fit import ServoRecord
 
 AXES = ("x", "y")
@@ -34,7 +35,7 @@ LEVELS_MIN = 3
 HELD_OUT_SHARE = 1.0 / 3.0
 """Part held out of each run where fewer amplitudes were recorded, once each: its end."""
 SAMPLES_MIN = 200
-DIFFERENCE_ORDERS = (2, 4, 6, 8)
+DIFFERENCES = (2, 4, 6, 8)
 """Orders of differences from which the noise is estimated: a response is smooth, white noise is not."""
 RECORD_NOISE_MIN = 1e-5
 RANGE_MAX = 8000
@@ -247,7 +248,7 @@ def _build_records(
     t_s, value = signal.t_s[good], signal.value[good]
     if len(t_s) < SAMPLES_MIN:
         raise InputError(f"{where}: {run.name}/mirror_{AXES[axis]}_rad", len(t_s), f"at least {SAMPLES_MIN} samples")
-    noise = estimate_noise(value)
+    noise = max(estimate_noise([value], DIFFERENCES), RECORD_NOISE_MIN * float(np.std(value)), 1e-300)
     until = int(len(t_s) * (1.0 - HELD_OUT_SHARE)) if is_divided else len(t_s)
     for part, held_out in ((slice(0, until), is_held_out), (slice(until, None), True)):
         use, every = np.zeros(len(t_s), dtype=np.bool_), np.arange(len(t_s))[part]
@@ -257,15 +258,3 @@ def _build_records(
             rows = commands[:, 0] <= t_s[end - 1]
             at_s, command = commands[rows, 0], commands[rows, 1 + axis]
             yield ServoRecord(at_s, command, t_s[:end], value[:end], use[:end], held_out, noise, level)
-
-
-def estimate_noise(value: FloatArray) -> float:
-    """Return the rms noise of a sample, the least of estimates from differences of several orders."""
-    estimates = []
-    for order in DIFFERENCE_ORDERS:
-        weights = np.ones(1)
-        for _ in range(order):
-            weights = np.convolve(weights, [1.0, -1.0])
-        difference = np.convolve(value, weights, "valid")
-        estimates.append(1.4826 * float(np.median(np.abs(difference))) / float(np.sqrt((weights**2).sum())))
-    return max(min(estimates), RECORD_NOISE_MIN * float(np.std(value)), 1e-300)
