@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import beta, t
 
-SLOPES = np.geomspace(1.5, 6.0, 7)
 LAPSES = ((0.0, 0.31), (0.025, 0.31), (0.05, 0.31), (0.1, 0.04), (0.2, 0.02), (0.35, 0.01))
 GUESSES = ((0.02, 0.25), (0.05, 0.2), (0.1, 0.2), (0.2, 0.2), (0.35, 0.15))
 
@@ -54,17 +53,18 @@ def describe_mean(values):
     return {"mean": float(np.mean(values)), "low": float(np.mean(values) - half), "high": float(np.mean(values) + half)}
 
 
-def estimate_threshold(levels, guess, level, is_correct):
+def estimate_threshold(levels, guess, slopes, level, is_correct):
     """Return median and central 95 % interval of the threshold of a Weibull function, from a grid.
 
     levels: of the design; guess: the share of correct answers by guessing, None if it is to be fitted
+    slopes: of the grid
     """
     logs = np.linspace(np.log(levels[0] / 4.0), np.log(levels[-1] * 4.0), 121)
     total = np.zeros(len(logs))
     habits = [(g, lapse, p * q) for g, p in (GUESSES if guess is None else ((guess, 1.0),)) for lapse, q in LAPSES]
     scores = []
     for guess_rate, lapse, prior in habits:
-        drive = np.exp(SLOPES[None, :, None] * (np.log(level)[None, None, :] - logs[:, None, None]))
+        drive = np.exp(slopes[None, :, None] * (np.log(level)[None, None, :] - logs[:, None, None]))
         share = np.minimum(guess_rate + (1.0 - guess_rate - lapse) * -np.expm1(-drive), 1.0 - 1e-9)
         scores.append(np.log(np.where(is_correct, share, 1.0 - share)).sum(axis=2) + np.log(prior))
     largest = max(score.max() for score in scores)
@@ -96,10 +96,11 @@ def analyse(folder, task):
     levels = sorted({*map(float, description[column]["Levels"]), *(float(row[column]) for row in main)})
     is_yes_no = len({row["correct_answer"] for row in judged}) < 2
     guess = None if is_yes_no else description["Analysis"]["GuessRate"]
+    slopes = np.geomspace(*description["Analysis"]["Slopes"], 7)
     for key in dict.fromkeys((row["participant"], row["session"], row.get("block", "")) for row in judged):
         own = [row for row in judged if (row["participant"], row["session"], row.get("block", "")) == key]
         tested = np.array([float(row[column]) for row in own])
-        found = estimate_threshold(levels, guess, tested, np.array([row["is_correct"] == "1" for row in own]))
+        found = estimate_threshold(levels, guess, slopes, tested, np.array([row["is_correct"] == "1" for row in own]))
         found["is_within_levels"] = bool(tested.min() <= found["threshold"] <= tested.max())
         results["thresholds"].append({"participant": key[0], "session": key[1] or None, **found})
     return results

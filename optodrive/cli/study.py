@@ -210,6 +210,7 @@ def power(
         "mean": effect.mean,
         "test": effect.test,
         "simulated_participants": count,
+        "simulated_participants_with_a_value": effect.known,
         "spread": spread,
         "enough_participants": enough,
         "powers": [one._asdict() for one in powers],
@@ -232,6 +233,8 @@ def _format_powers(report: dict[str, Any]) -> Iterator[str]:
     yield f"test             {report['test']}"
     alike = "all alike; --spread states how they differ" if report["spread"] == 0.0 else f"spread {report['spread']:g}"
     yield f"simulated        {report['simulated_participants']} participants, {alike}"
+    if (known := report["simulated_participants_with_a_value"]) < report["simulated_participants"]:
+        yield f"known            of {known} of them; those whose threshold the levels do not determine do not enter"
     for one in report["powers"]:
         shown = f"power {one['power']:.3f} (95 % interval {one['low']:.3f} to {one['high']:.3f})"
         yield f"{one['participants']:<17}{shown}, effect {one['effect_low']:.4g} to {one['effect_high']:.4g}"
@@ -496,9 +499,9 @@ def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], ou
         report |= {"correct": counted.correct, "judged": counted.trials, "accuracy": counted.share}
     elif design.response.kind == "magnitude" and len(design.factors) == 1 and all(sessions.values()):
         report["line"] = fit_magnitudes(design, list(sessions.values()))._asdict()
-    if design.procedure is not None:
-        report["threshold_of"] = design.procedure.parameter
-        report["thresholds"] = list_thresholds(design, design.procedure, sessions)
+    if design.threshold_of is not None:
+        report["threshold_of"] = design.threshold_of
+        report["thresholds"] = list_thresholds(design, sessions)
     if published is not None:
         report["published"] = published.model_dump(mode="json") | {"trials": published.trials}
         if published.correct is not None:

@@ -15,6 +15,7 @@ from optodrive.core.files import create_folder, lock_folder, read_regular_file, 
 from optodrive.core.numeric_tables import escape_formula
 from optodrive.study.study_file import SIMULATED_PREFIX, Study
 from optodrive.study.study_sections import QuestionSection
+from optodrive.study.threshold import DIFFERENCE_SLOPES, SLOPE_RANGE
 from optodrive.study.trial_list import find_exclusion, find_session_exclusion
 from optodrive.study.trial_log import has_stimuli, read_records
 
@@ -283,7 +284,8 @@ def _describe_task(study: Study) -> dict[str, Any]:
         **columns,
         "Analysis": {
             "GuessRate": response.chance_level,
-            "Level": None if study.procedure is None else study.procedure.parameter,
+            "Level": study.threshold_of,
+            "Slopes": SLOPE_RANGE if study.response.level is None else DIFFERENCE_SLOPES,
             "EqualInterval": None if study.procedure is None else study.procedure.equal_interval,
             "Factors": [name for name in study.varied if study.procedure is None or name != study.procedure.parameter],
         },

@@ -65,6 +65,8 @@ class Participant:
 
     localisation_sd_m: float = 1.35e-3
     lapse: float = 0.025
+    acuity: float = 1.0
+    """Factor by which places, features of intervals and onsets are told apart more finely."""
 
 
 def draw_sensitivity(layout: PixelLayout, sensitivity_range: float, rng: np.random.Generator) -> FloatArray:
@@ -149,7 +151,7 @@ class Observer:
 
     def _perceive_places(self, visits: Visits, rng: np.random.Generator) -> FloatArray:
         """Return perceived places, m, [n, 2]."""
-        sd_m = self._participant.localisation_sd_m * np.sqrt(REFERENCE_S / visits.exposure_s)
+        sd_m = self._participant.localisation_sd_m / self._participant.acuity * np.sqrt(REFERENCE_S / visits.exposure_s)
         return np.asarray(visits.position_m + sd_m[:, None] * rng.standard_normal((len(sd_m), 2)))
 
     def _judge_linear_motion(self, shown: Presentation, rng: np.random.Generator) -> str:
@@ -225,7 +227,8 @@ class Observer:
         """Name the interval with the largest feature by its place."""
         feature = "intensity" if self.study.simulation is None else self.study.simulation.feature
         felt = [self._measure(feature, shown, rows) if len(rows) else 0.0 for rows in self._split(shown)]
-        noisy = np.array(felt) + FEATURE_NOISE[feature] * rng.standard_normal(len(felt))
+        sd = FEATURE_NOISE[feature] / (1.0 if feature == "intensity" else self._participant.acuity)
+        noisy = np.array(felt) + sd * rng.standard_normal(len(felt))
         return self.study.response.answers[int(noisy.argmax())]
 
     def _measure(self, feature: str, shown: Presentation, rows: IntArray) -> float:
@@ -245,7 +248,8 @@ class Observer:
     def _order(self, shown: Presentation, rng: np.random.Generator) -> str:
         """Name the interval that seems to begin first."""
         onset_s = [shown.start_s[rows[0]] if len(rows) else np.inf for rows in self._split(shown)]
-        return shown.intervals[int(np.argmin(np.array(onset_s) + ORDER_SD_S * rng.standard_normal(len(onset_s))))].name
+        sd_s = ORDER_SD_S / self._participant.acuity
+        return shown.intervals[int(np.argmin(np.array(onset_s) + sd_s * rng.standard_normal(len(onset_s))))].name
 
     def _identify(self, shown: Presentation, rng: np.random.Generator) -> str:
         """Name the pattern whose places are nearest to those that are felt."""

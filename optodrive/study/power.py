@@ -76,6 +76,11 @@ class Effect(NamedTuple):
     trials: FloatArray | None
 
     @property
+    def known(self) -> int:
+        """Number of simulated participants with a value."""
+        return int(np.isfinite(self.values).sum())
+
+    @property
     def mean(self) -> float:
         """Mean of the simulated participants."""
         return float(np.nanmean(self.values))
@@ -105,7 +110,7 @@ def simulate_sessions(
     """Return the records of all trials of simulated participants, by participant and session, without practice.
 
     spread: standard deviation of the logarithm of the participants' acuity, by which their sensitivity is higher and
-    their sense of place finer
+    places, features of intervals and onsets are told apart more finely
     """
     if study.simulation is None:
         raise InputError(f"study {study.name}: simulation", None, "an observer, to simulate a participant")
@@ -114,9 +119,7 @@ def simulate_sessions(
         rng = np.random.default_rng((study.seed, number))
         sensitivity = draw_sensitivity(display.layout, study.simulation.sensitivity_range, rng)
         acuity = exp(spread * float(rng.standard_normal()))
-        typical = Participant()
-        participant = Participant(typical.localisation_sd_m / acuity, typical.lapse)
-        observer = Observer(study, display, participant, acuity * sensitivity)
+        observer = Observer(study, display, Participant(acuity=acuity), acuity * sensitivity)
         sessions = []
         for session in range(1, study.sessions + 1):
             respondent = SimulatedRespondent(observer, study.seed, number, presenter, session)
@@ -172,12 +175,17 @@ def measure_effect(
     compare: factor whose first and last value are compared; None for the share of correct answers, or the threshold
     """
     kept = [[_keep(study, records) for records in sessions] for sessions in people]
-    if study.procedure is not None and compare is None:
-        if reference is None or reference <= 0.0:
-            expected = f"a value of {study.procedure.parameter} from which the threshold is to be told apart"
+    sought = study.threshold_of
+    if sought is not None and compare is None and (study.procedure is not None or reference is not None):
+        levels = study.threshold_levels
+        is_within = reference is not None and levels[0] <= reference <= levels[-1]
+        if reference is None or reference <= 0.0 or not (is_within or study.procedure is not None):
+            expected = (
+                f"a value of {sought}, {levels[0]:g} to {levels[-1]:g}, from which the threshold is to be told apart"
+            )
             raise InputError("--reference", MISSING if reference is None else reference, expected)
         values = np.array([_find_log_threshold(study, sessions) for sessions in kept])
-        return Effect(f"logarithm of {study.procedure.parameter}", log(reference), values, None)
+        return Effect(f"logarithm of {sought}", log(reference), values, None)
     people_records = [[record for session in sessions for record in session] for sessions in kept]
     if compare is not None:
         return _compare(study, people_records, compare, reference)
@@ -203,9 +211,7 @@ def _keep(study: Study, records: Sequence[dict[str, Any]]) -> list[dict[str, Any
 
 def _find_log_threshold(study: Study, sessions: Sequence[Sequence[dict[str, Any]]]) -> float:
     """Return the mean logarithm of a participant's thresholds or equalities, NaN without one."""
-    if study.procedure is None:
-        return float("nan")
-    found = list_thresholds(study, study.procedure, {str(k): session for k, session in enumerate(sessions)})
+    found = list_thresholds(study, {str(k): session for k, session in enumerate(sessions)})
     levels = [one.get("threshold", one.get("equality")) for one in found.values()]
     logs = [log(level) for level in levels if level is not None and level > 0.0]
     return float(np.mean(logs)) if logs else float("nan")

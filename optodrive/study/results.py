@@ -17,7 +17,7 @@ from optodrive.device.sensitivity_map import SensitivityMap, write_sensitivity_m
 from optodrive.study.matching import BOTH_THRESHOLDS
 from optodrive.study.session import build_matching_model, build_threshold_model, list_answered, list_comparisons
 from optodrive.study.study_file import Study
-from optodrive.study.study_sections import MatchingSection, ProcedureSection, Value
+from optodrive.study.study_sections import MatchingSection, Value
 from optodrive.study.threshold import sum_binomial
 
 CONFIDENCE = 0.95
@@ -70,20 +70,19 @@ def count_correct(records: Sequence[dict[str, Any]]) -> Accuracy:
     return Accuracy(sum(record["is_correct"] for record in judged), len(judged))
 
 
-def list_thresholds(
-    study: Study, procedure: ProcedureSection, sessions: Mapping[str, Sequence[dict[str, Any]]]
-) -> dict[str, dict[str, Any]]:
-    """Return the threshold, or the equality, of each session and block by their names."""
+def list_thresholds(study: Study, sessions: Mapping[str, Sequence[dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    """Return the threshold, or the equality, of each session and block of a study with levels by their names."""
     found: dict[str, dict[str, Any]] = {}
     blocks = study.block_list
+    is_equality = study.procedure is not None and study.procedure.equal_interval is not None
     for name, records in sessions.items():
         for block in blocks:
-            answered = list_answered(procedure, [record for record in records if record["block"] == block.name])
+            answered = list_answered(study, [record for record in records if record["block"] == block.name])
             key = name if len(blocks) == 1 else f"{name} {block.name}"
-            if procedure.equal_interval is None:
-                found[key] = build_threshold_model(study, procedure).estimate(answered)._asdict()
+            if is_equality:
+                found[key] = find_equality(study.threshold_levels, answered)
             else:
-                found[key] = find_equality(procedure.levels, answered)
+                found[key] = build_threshold_model(study).estimate(answered)._asdict()
     return found
 
 

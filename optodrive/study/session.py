@@ -15,8 +15,8 @@ from optodrive.study.matching import Comparison, MatchingModel
 from optodrive.study.observers import Observer
 from optodrive.study.presenter import Presentation, Presenter
 from optodrive.study.study_file import MATCHING_ANSWERS, Study
-from optodrive.study.study_sections import MatchingSection, ProcedureSection, QuestionSection, Value
-from optodrive.study.threshold import ThresholdModel, select_staircase_level
+from optodrive.study.study_sections import MatchingSection, QuestionSection, Value
+from optodrive.study.threshold import DIFFERENCE_SLOPES, SLOPE_RANGE, ThresholdModel, select_staircase_level
 from optodrive.study.trial_list import ListedTrial
 from optodrive.study.trial_log import TrialLog
 from optodrive.study.trial_stimulus import (
@@ -133,15 +133,16 @@ class SimulatedRespondent(Respondent):
         }
 
 
-def list_answered(procedure: ProcedureSection, records: Sequence[dict[str, Any]]) -> list[tuple[int, bool]]:
-    """Return level and correctness of the answered trials of a procedure, in order, without practice and catch trials.
+def list_answered(study: Study, records: Sequence[dict[str, Any]]) -> list[tuple[int, bool]]:
+    """Return level and correctness of the answered main trials of a study with levels, in order.
 
     Where an equality is sought, an answer that names the interval counts as correct: it lowers the level.
     """
-    name = procedure.equal_interval
+    name = None if study.procedure is None else study.procedure.equal_interval
+    levels, level_name = study.threshold_levels, str(study.threshold_of)
     return [
         (
-            procedure.levels.index(record["condition"][procedure.parameter]),
+            levels.index(float(record["condition"][level_name])),
             bool(record["is_correct"]) if name is None else record["chosen_interval"] == name,
         )
         for record in records
@@ -172,22 +173,23 @@ def choose_condition(study: Study, log: TrialLog, trial: int, matching: Matching
     if procedure is None or procedure.parameter in condition:
         return condition
     records = [log.trials[index] for index in sorted(log.trials)]
-    answered = list_answered(procedure, [record for record in records if record["block"] == listed.block])
+    answered = list_answered(study, [record for record in records if record["block"] == listed.block])
     if procedure.kind == "staircase":
         level = select_staircase_level(len(procedure.levels), answered, procedure.down)
     else:
-        level = build_threshold_model(study, procedure).select_informative_level(answered)
+        level = build_threshold_model(study).select_informative_level(answered)
     return {**condition, procedure.parameter: procedure.levels[level]}
 
 
 @lru_cache(maxsize=4)
-def _build_model(levels: tuple[float, ...], chance: float) -> ThresholdModel:
-    return ThresholdModel(levels, chance)
+def _build_model(levels: tuple[float, ...], chance: float, slope_range: tuple[float, float]) -> ThresholdModel:
+    return ThresholdModel(levels, chance, slope_range)
 
 
-def build_threshold_model(study: Study, procedure: ProcedureSection) -> ThresholdModel:
-    """Return the model of a procedure's threshold."""
-    return _build_model(procedure.levels, 1.0 / len(study.response.answers))
+def build_threshold_model(study: Study) -> ThresholdModel:
+    """Return the model of a study's threshold."""
+    slope_range = SLOPE_RANGE if study.response.level is None else DIFFERENCE_SLOPES
+    return _build_model(study.threshold_levels, 1.0 / len(study.response.answers), slope_range)
 
 
 def run_session(

@@ -37,6 +37,8 @@ EXPERIMENTS = Path(__file__).with_name("experiments")
 SIMULATED_PREFIX = "sim"
 """Beginning of the identifiers of simulated participants."""
 TRIALS_MAX = 10_000
+LEVELS_MIN = 3
+"""Smallest number of levels of a psychometric function."""
 MATCHING_ANSWERS = ("first", "second")
 OBSERVER_ANSWERS: dict[str, tuple[str, ...]] = {
     "linear-motion": ("left", "right", "up", "down"),
@@ -117,6 +119,7 @@ class Study(Section):
         self._check_factors()
         self._check_blocks()
         self._check_answer()
+        self._check_level()
         if self.procedure is not None:
             self._check_procedure(self.procedure)
         if self.trial_count > TRIALS_MAX:
@@ -217,6 +220,28 @@ class Study(Section):
                 if str(value) not in response.answers:
                     raise ConflictError(place, value, "one of the answers")
 
+    def _check_level(self) -> None:
+        """Raise ConflictError for a level along which no psychometric function can be fitted."""
+        level, place = self.response.level, "response.level"
+        if level is None:
+            return
+        if self.procedure is not None:
+            raise ConflictError(place, level, "none beside [procedure], which has levels of its own")
+        if not self.response.rules:
+            raise ConflictError("response.correct_factor", MISSING, "a rule of the correct answer beside a level")
+        listed = [(where, values) for where, name, values in self._list_factors() if name == level]
+        known = dict.fromkeys(name for _, name, _ in self._list_factors())
+        if not any(not where.startswith("practice") for where, _ in listed):
+            raise ConflictError(place, level, f"one of {', '.join(known) or 'the factors, of which there is none'}")
+        for where, values in listed:
+            for value in values:
+                if isinstance(value, str) or value <= 0.0:
+                    raise ConflictError(where, value, f"numbers above 0: {place}")
+        if len(self.threshold_levels) < LEVELS_MIN:
+            raise ConflictError(place, level, f"a factor with at least {LEVELS_MIN} values")
+        if self.order.blocked_by == level:
+            raise ConflictError("order.blocked_by", level, f"another factor: a block has all values of {place}")
+
     def _check_procedure(self, procedure: ProcedureSection) -> None:
         if procedure.equal_interval is not None:
             if self.response.rules or self.interval_names.count(procedure.equal_interval) != 1:
@@ -314,6 +339,19 @@ class Study(Section):
         changed |= {name for levels in self.levels.values() for level in levels.values() for name in level.parameters}
         constants = {name: (value,) for name, value in self.stimulus.parameters.items() if name not in changed}
         return {**self.varied, **constants}
+
+    @property
+    def threshold_of(self) -> str | None:
+        """The parameter or factor whose threshold, or equality, the study finds."""
+        return self.response.level if self.procedure is None else self.procedure.parameter
+
+    @property
+    def threshold_levels(self) -> tuple[float, ...]:
+        """Levels of `threshold_of` in increasing order."""
+        if self.procedure is not None:
+            return self.procedure.levels
+        listed = [one for one in self._list_factors() if one[1] == self.response.level and one[0][:8] != "practice"]
+        return tuple(sorted({float(value) for _, _, values in listed for value in values}))
 
     def count_trials(self, block: BlockSection) -> int:
         """Return the number of trials of a block, without catch trials."""

@@ -157,6 +157,8 @@ class ResponseSection(Section):
     """The parameter by whose largest value an interval is the correct one; the answers are the places in order."""
     correct_position: Annotated[int, Field(ge=1, le=10)] | None = None
     """The place whose interval's name is the correct answer."""
+    level: Name | None = None
+    """The factor along which a psychometric function is fitted, with numbers of which 0 would be no difference."""
     chance_level: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     """Share of correct answers by guessing; states the design's, and is checked."""
     min_s: Annotated[float, Field(ge=0.0, le=60.0)] | None = None
@@ -187,6 +189,8 @@ class ResponseSection(Section):
     @model_validator(mode="after")
     def _check_answers(self) -> "ResponseSection":
         if self.kind != "choice":
+            if self.level is not None:
+                raise ConflictError("level", self.level, f"none: {self.kind} has no correct answer")
             if self.answers or self.labels or self.rules or self.chance_level:
                 raise ConflictError(
                     "answers", self.answers, f"none, no correct answer and no chance_level: {self.kind}"

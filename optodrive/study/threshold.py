@@ -37,6 +37,8 @@ THRESHOLDS, SLOPES = 121, 7
 MARGIN = 4.0
 """Factor by which the grid of thresholds goes beyond the levels."""
 SLOPE_RANGE = (1.5, 6.0)
+DIFFERENCE_SLOPES = (0.75, 3.0)
+"""Slopes over a difference of two intervals: 1.25 times the exponent of d', some 0.6 to 2.4 (Strasburger 2001)."""
 LAPSE_RANGE = (0.0, 0.05)
 """Lapses of a participant who attends."""
 LAPSES = ((0.0, 0.31), (0.025, 0.31), (0.05, 0.31), (0.1, 0.04), (0.2, 0.02), (0.35, 0.01))
@@ -111,11 +113,12 @@ class ThresholdModel:
     """Posterior of a threshold over a grid that spans the levels.
 
     levels: increasing and positive; chance: probability of a correct answer by guessing, None if the participant
-    chooses it, as in a yes/no task
+    chooses it, as in a yes/no task; slope_range: of the grid
     """
 
     levels: tuple[float, ...]
     chance: float | None
+    slope_range: tuple[float, float] = SLOPE_RANGE
 
     @cached_property
     def log_thresholds(self) -> FloatArray:
@@ -135,7 +138,7 @@ class ThresholdModel:
         return self._compute_shares(self.levels)
 
     def _compute_shares(self, levels: Sequence[float]) -> FloatArray:
-        slopes, (guesses, lapses, _) = np.geomspace(*SLOPE_RANGE, SLOPES), self._habits.T
+        slopes, (guesses, lapses, _) = np.geomspace(*self.slope_range, SLOPES), self._habits.T
         log_level = np.log(levels)[:, None, None, None]
         drive = np.exp(slopes[:, None] * (log_level - self.log_thresholds[:, None, None]))
         share = guesses + (1.0 - guesses - lapses) * -np.expm1(-drive)
@@ -213,7 +216,8 @@ class ThresholdModel:
         if 2.0 * (float(self._compute_log_likelihood(answered).max()) - guessing) > LIKELIHOOD_RATIO:
             return None
         # Fewer answers are correct at higher levels.
-        falling = ThresholdModel(self.levels, None)._compute_log_likelihood([(k, not right) for k, right in answered])
+        exchanged = [(level, not is_correct) for level, is_correct in answered]
+        falling = ThresholdModel(self.levels, None, self.slope_range)._compute_log_likelihood(exchanged)
         return Flag.EXCHANGED_KEYS if 2.0 * (float(falling.max()) - guessing) > EXCHANGED_RATIO else Flag.GUESSING
 
     def select_informative_level(self, answered: Answered) -> int:

@@ -26,6 +26,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.study.results import CONFIDENCE, Accuracy, find_equality
 from optodrive.study.threshold import (
     GUESSING_MAX,
+    SLOPE_RANGE,
     Flag,
     ThresholdEstimate,
     ThresholdModel,
@@ -131,10 +132,9 @@ class TrialTable:
 
     @cached_property
     def analysis(self) -> Mapping[str, Any]:
-        """Guess rate, column of levels, columns of factors and interval of an equality."""
-        return {"GuessRate": None, "Level": None, "Factors": [], "EqualInterval": None} | dict(
-            self.description.get("Analysis", {})
-        )
+        """Guess rate, column of levels, slopes, columns of factors and interval of an equality."""
+        usual = {"GuessRate": None, "Level": None, "Slopes": SLOPE_RANGE, "Factors": [], "EqualInterval": None}
+        return usual | dict(self.description.get("Analysis", {}))
 
     @cached_property
     def correct_answers(self) -> tuple[str, ...]:
@@ -163,7 +163,8 @@ class TrialTable:
     @cached_property
     def model(self) -> ThresholdModel:
         """Model of the thresholds."""
-        return ThresholdModel(self.levels, self.guess_rate)
+        low, high = self.analysis["Slopes"]
+        return ThresholdModel(self.levels, self.guess_rate, (float(low), float(high)))
 
     def list_thresholds(self) -> Iterator[ThresholdResult]:
         """Yield the threshold, or the equality, of each participant, session and block."""

@@ -1,12 +1,17 @@
 """Power from simulated participants against computations that share no code with it: binomial, mixed and Student's."""
 
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import binom, binomtest, nct, norm, t
 
 from optodrive.cli.main import run
+
+sys.path.append(str(Path(__file__).parents[2] / "docs" / "examples"))
+from analyse_study import estimate_threshold
 
 TOLERANCE = 0.05
 LAPSE, SPREAD = 0.025, 0.35
@@ -117,11 +122,57 @@ def test_thresholds_have_the_power_of_students_interval(capsys, tmp_path):
         assert one["power"] == pytest.approx(expected, abs=2 * TOLERANCE)
 
 
+def simulate_gaps(people, spread, seed=3):
+    """Return shares of correct answers by gap [n, 5], and logarithms of thresholds [n], by the closed form."""
+    rng, gaps = np.random.default_rng(seed), np.array([5.0, 10.0, 20.0, 40.0, 80.0])
+    acuity = np.exp(spread * rng.standard_normal(people))
+    share = 0.5 * LAPSE + (1.0 - LAPSE) * norm.cdf(gaps * acuity[:, None] / (10.0 * np.sqrt(2.0)))
+    counts = rng.binomial(10, share)
+    slopes, found = np.geomspace(0.75, 3.0, 7), []
+    for one in counts:
+        answers = np.concatenate([np.arange(10) < count for count in one])
+        threshold = estimate_threshold(gaps, 0.5, slopes, np.repeat(gaps, 10), answers)["threshold"]
+        found.append(np.log(threshold) if 5.0 <= threshold <= 80.0 else np.nan)
+    return counts / 10.0, np.array(found)
+
+
+def compute_student_power(values, number, reference, studies=20_000):
+    drawn = np.random.default_rng(4).choice(values, size=(studies, number))
+    half = t.ppf(0.975, number - 1) * drawn.std(axis=1, ddof=1) / np.sqrt(number)
+    return float((np.abs(drawn.mean(axis=1) - reference) > half).mean())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", [8.0, 16.0])
+def test_thresholds_of_a_design_with_levels_have_the_power_of_other_code(capsys, reference):
+    words = ["gap-detection", "--participants", "4..40", "--spread", str(SPREAD), "--seeds", "3000"]
+    report, powers = estimate(capsys, *words, "--reference", str(reference))
+    assert report["effect"] == "logarithm of gap_ms"
+    _, thresholds = simulate_gaps(3000, SPREAD)
+    known = thresholds[np.isfinite(thresholds)]
+    assert report["simulated_participants_with_a_value"] / 3000 == pytest.approx(len(known) / 3000, abs=0.03)
+    expected = {number: compute_student_power(known, number, np.log(reference)) for number in powers}
+    assert {number: one["power"] for number, one in powers.items()} == pytest.approx(expected, abs=TOLERANCE)
+    assert expected[40] - expected[4] > 0.4
+
+
+@pytest.mark.parametrize("seeds", [600, pytest.param(5000, marks=pytest.mark.slow)])
+def test_shares_of_a_design_with_levels_have_the_power_of_a_mixed_model(capsys, seeds):
+    words = ["gap-detection", "--participants", "4..40", "--spread", str(SPREAD), "--seeds", str(seeds)]
+    _, powers = estimate(capsys, *words, "--compare", "gap_ms", "--reference", "0.32")
+    shares, _ = simulate_gaps(5000, SPREAD)
+    differences = shares[:, -1] - shares[:, 0]
+    expected = {number: compute_student_power(differences, number, 0.32) for number in powers}
+    tolerance = TOLERANCE if seeds == 5000 else 2.0 * TOLERANCE  # the spread of 600 simulated participants
+    assert {number: one["power"] for number, one in powers.items()} == pytest.approx(expected, abs=tolerance)
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
         (["detection"], "--reference: missing, expected a value of power_mw"),
         (["detection", "--reference", "-3"], "--reference: got -3"),
+        (["gap-detection", "--reference", "0.7"], "--reference: got 0.7, expected a value of gap_ms, 5 to 80,"),
         (["experiment-4"], "--compare: missing, expected one of level"),
         (["experiment-2", "--compare", "spede"], "--compare: got 'spede', expected one of direction, speed"),
         (["experiment-1", "--participants", "1..5"], "--participants: got '1..5'"),

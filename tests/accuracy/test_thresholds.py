@@ -223,7 +223,7 @@ def run_detection(display, path, number, trials_before=None):
             except EndsEarlyError:
                 continue
             records = [log.trials[index] for index in sorted(log.trials)]
-    return study, list_answered(study.procedure, records)
+    return study, list_answered(study, records)
 
 
 def test_an_adaptive_session_goes_on_as_if_it_had_not_ended(display, tmp_path):
@@ -245,7 +245,7 @@ def test_the_shipped_study_finds_the_threshold_of_the_channel_model(display, tmp
     ratios = []
     for number in range(6):
         study, answered = run_detection(display, tmp_path / f"{number}.jsonl", number)
-        found = build_threshold_model(study, study.procedure).estimate(answered)
+        found = build_threshold_model(study).estimate(answered)
         assert found.threshold is not None
         ratios.append(found.threshold / threshold_mw)
         assert found.low is None or found.low < threshold_mw

@@ -117,9 +117,9 @@ DISCRIMINATION = [
     ("trials_max = 24", "trials_max = 3", "practice.trials_max: got 3, expected at least 6"),
     ("trials_max = 24\n", "", "practice.trials_max: got None, expected stated beside a criterion"),
     (
-        "factors = { rate_hz = [50.0] }",
-        "factors = { rate = [50.0] }",
-        "practice.factors.rate: got [50.0], expected a factor",
+        "factors = { difference_hz = [25] }",
+        "factors = { difference = [25] }",
+        "practice.factors.difference: got [25], expected a factor",
     ),
     ("gap_s = 0.5", "gap_s = -0.5", "intervals.1.gap_s: got -0.5, expected greater than or equal to 0"),
     (
@@ -129,14 +129,18 @@ DISCRIMINATION = [
     ),
     (
         "[order]",
-        '[order]\nblocked_by = "rate"',
-        "order.blocked_by: got 'rate', expected a factor, nearest is 'rate_hz'",
+        '[order]\nblocked_by = "difference"',
+        "order.blocked_by: got 'difference', expected a factor, nearest is 'difference_hz'",
     ),
     ("min_s = 0.1", "min_s = 9.0", "response.max_s: got 8.0, expected more than min_s, 9"),
     ('name = "hand"', 'name = "age"', "questions: got ['age', 'age', 'strategy'], expected names that differ"),
     ('answers = ["left", "right", "both"]', "", "questions.1.answers: got [], expected at least two"),
-    ("[catch]", '[levels.rate_hz]\n"99.0" = {}\n[catch]', "levels.rate_hz: got '99.0', expected a value of the factor"),
-    ("[catch]", "[levels.rate]\nx = {}\n[catch]", "levels.rate: got 'rate', expected a factor, nearest is 'rate_hz'"),
+    ("[catch]", "[levels.difference_hz.99]\n[catch]", "levels.difference_hz: got '99', expected a value of the factor"),
+    (
+        "[catch]",
+        "[levels.difference]\nx = {}\n[catch]",
+        "levels.difference: got 'difference', expected a factor, nearest is 'difference_hz'",
+    ),
     (
         'pattern = "vibration"',
         'pattern = "vibration"\nframes = { trains = [] }',
@@ -144,6 +148,33 @@ DISCRIMINATION = [
     ),
     ('pattern = "vibration"\n', "", "stimulus.pattern: missing, expected a pattern, or frames"),
     ("[catch]", '[[blocks]]\nname = "A"\n[catch]', "blocks.0.name: got 'A'"),
+    ('level = "difference_hz"', 'level = "rate_hz"', "response.level: got 'rate_hz', expected one of difference_hz"),
+    ("difference_hz = [2, 5,", 'difference_hz = ["2", 5,', "factors.difference_hz: got '2', expected numbers above 0"),
+    ("difference_hz = [2, 5,", "difference_hz = [0, 2, 5,", "factors.difference_hz: got 0, expected numbers above 0"),
+    (
+        "difference_hz = [25]",
+        "difference_hz = [-1]",
+        "practice.factors.difference_hz: got -1, expected numbers above 0",
+    ),
+    (
+        "[order]",
+        '[order]\nblocked_by = "difference_hz"',
+        "order.blocked_by: got 'difference_hz', expected another factor",
+    ),
+    (
+        'kind = "choice"\nquestion = "Which was',
+        'kind = "number"\nquestion = "Which was',
+        "response.level: got 'difference_hz', expected none: number",
+    ),
+]
+ORDER = [
+    ("correct_position = 1\n", "", "response.correct_factor: missing, expected a rule of the correct answer"),
+    ('level = "onset_ms"', 'level = "onset"', "response.level: got 'onset', expected one of onset_ms"),
+    (
+        "[simulation]",
+        '[procedure]\nkind = "constant"\nparameter = "x"\nlevels = [1, 2, 3]\ntrials = 9\n[simulation]',
+        "response.level: got 'onset_ms', expected none beside [procedure]",
+    ),
 ]
 
 
@@ -152,6 +183,7 @@ DISCRIMINATION = [
     [
         *(("experiment-1", *each) for each in EXPERIMENT),
         *(("frequency-discrimination", *each) for each in DISCRIMINATION),
+        *(("temporal-order", *each) for each in ORDER),
     ],
 )
 def test_a_wrong_file_is_refused_in_one_line(tmp_path, name, old, new, says):
@@ -168,6 +200,17 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path, name, old, new, says):
     stated = int(message.removeprefix(f"{path}, line ").partition(":")[0])
     changed = path.read_text().splitlines()
     assert 1 <= stated <= len(changed)
+
+
+def test_a_level_has_three_values_at_least(tmp_path):
+    path, text = tmp_path / "study.toml", (EXPERIMENTS / "temporal-order.toml").read_text()
+    path.write_text(
+        text.replace("onset_ms = [10", "twice = [1, 2]\nonset_ms = [10").replace('= "onset_ms"', '= "twice"')
+    )
+    with pytest.raises(InputError, match=r"line [0-9]+: response.level: got 'twice', expected a factor with at"):
+        load_study(str(path))
+    path.write_text(text)
+    assert load_study(str(path)).threshold_levels == (10.0, 20.0, 40.0, 80.0, 160.0)
 
 
 def test_an_unknown_study_is_told_the_shipped_ones():

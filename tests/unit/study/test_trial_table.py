@@ -196,6 +196,37 @@ def test_a_damaged_dataset_is_refused_in_one_line(tmp_path, capsys, damage, says
     assert error.count("\n") == 1
 
 
+def compare_with_the_script(folder, task, report):
+    """Assert that the example script finds the thresholds and accuracies of a report; return what it prints."""
+    done = subprocess.run([sys.executable, EXAMPLE, folder, task], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    script = json.loads(done.stdout)
+    for name, one in script["participants"].items():
+        found = report["participants"][name]["accuracy"]
+        assert (found["correct"], found["trials"]) == (one["correct"], one["trials"])
+        assert found["interval"] == pytest.approx(one["interval"], abs=1e-9)
+    assert len(report["thresholds"]) == len(script["thresholds"])
+    for found, one in zip(report["thresholds"], script["thresholds"], strict=True):
+        assert (found["threshold"] is not None) == one["is_within_levels"]
+        for key in ("threshold", "low", "high"):
+            assert found[key] is None or found[key] == pytest.approx(one[key], rel=1e-6)
+    return script
+
+
+def test_a_design_with_levels_has_its_thresholds_everywhere(tmp_path, capsys):
+    assert run(["study", "gap-detection", "--out", str(tmp_path), "--participants", "2", "--json"]) == 0
+    stated = json.loads(capsys.readouterr().out)
+    assert run(["study", "report", str(tmp_path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)["gapdetection"]
+    assert report["level"] == stated["threshold_of"] == "gap_ms"
+    compare_with_the_script(tmp_path, "gapdetection", report)
+    for one in report["thresholds"]:
+        assert all(stated["thresholds"][one["participant"]][key] == one[key] for key in ("threshold", "low", "high"))
+    page = (tmp_path / "derivatives" / "task-gapdetection_report.html").read_text()
+    assert page.count("share correct by gap_ms") >= 2
+    assert "gap_ms" in (tmp_path / "derivatives" / "task-gapdetection_trials.tsv").read_text().splitlines()[0].split()
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("felt")
@@ -207,23 +238,13 @@ def dataset(tmp_path_factory):
 def test_the_report_and_the_example_script_state_the_same_numbers(dataset, capsys):
     assert run(["study", "report", str(dataset), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)["felt"]
-    done = subprocess.run([sys.executable, EXAMPLE, dataset, "felt"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    script = json.loads(done.stdout)
+    script = compare_with_the_script(dataset, "felt", report)
     assert {name: one["counts"]["practice"] for name, one in report["participants"].items()} == dict.fromkeys(
         script["participants"], 4
     )
-    for name, one in script["participants"].items():
-        found = report["participants"][name]["accuracy"]
-        assert (found["correct"], found["trials"]) == (one["correct"], one["trials"])
-        assert found["interval"] == pytest.approx(one["interval"], abs=1e-9)
     for key in ("mean", "low", "high"):
         assert report["group"]["accuracy"][key] == pytest.approx(script["accuracy"][key])
-    assert len(report["thresholds"]) == len(script["thresholds"]) == 3
-    for found, one in zip(report["thresholds"], script["thresholds"], strict=True):
-        assert (found["threshold"] is not None) == one["is_within_levels"]
-        for key in ("threshold", "low", "high"):
-            assert found[key] is None or found[key] == pytest.approx(one[key], rel=1e-6)
+    assert len(script["thresholds"]) == 3
 
 
 def test_a_run_states_the_thresholds_of_its_report(dataset, capsys):
