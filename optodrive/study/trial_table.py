@@ -133,7 +133,13 @@ class TrialTable:
     @cached_property
     def analysis(self) -> Mapping[str, Any]:
         """Guess rate, column of levels, slopes, columns of factors and interval of an equality."""
-        usual = {"GuessRate": None, "Level": None, "Slopes": SLOPE_RANGE, "Factors": [], "EqualInterval": None}
+        usual: dict[str, Any] = {
+            "GuessRate": None,
+            "Level": None,
+            "Slopes": SLOPE_RANGE,
+            "Factors": [],
+            "EqualInterval": None,
+        }
         return usual | dict(self.description.get("Analysis", {}))
 
     @cached_property

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.cli.study import STUDY_HELP
+from optodrive.cli.study_numbers import STUDY_HELP
 from optodrive.core.errors import InputError
 from optodrive.study.dataset import build_log_path, check_new_participant, write_dataset
 from optodrive.study.study_file import list_shipped_studies, load_study
