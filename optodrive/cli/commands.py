@@ -29,6 +29,7 @@ MODULES = {
     "play": ("push", "play"),
     "braille": ("braille",),
     "fingers": ("fingers",),
+    "osc": ("osc",),
     "patterns": ("patterns",),
     "plan": ("plan",),
     "simulate": ("simulate",),

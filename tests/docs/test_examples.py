@@ -37,6 +37,7 @@ ELSEWHERE = {
     "/opt/optodrive/": "tests/system/test_service.py runs the commands of the service",
     "openssl req -x509": "tests/system/test_tls_proxy.py makes its certificate so",
     "optodrive braille": "tests/system/test_braille_command.py",
+    "optodrive osc": "tests/system/test_osc.py",
     "optodrive fingers": "tests/system/test_standing_frames.py",
     "optodrive study my-study.toml --out data --participant 07 --hold": "tests/browser/test_study_participant.py",
     "optodrive study my-study.toml --out data --participant 07 --lsl": "tests/system/test_study_streams.py",
