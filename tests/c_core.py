@@ -8,6 +8,7 @@ from pathlib import Path
 from firmware_ports import require
 from optodrive.link.protocol import messages as m
 from optodrive.link.simulator.guards import INTERFACES, BoardSettings
+from optodrive.link.simulator.measured_mirrors import MIRROR_FAULTS
 
 FIRMWARE = Path(__file__).parents[1] / "firmware_protocol"
 SHIM = Path(__file__).with_name("firmware") / "shim.c"
@@ -107,7 +108,7 @@ def load(path):
     library = ctypes.CDLL(str(path))
     handle, u64, u32, size = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint32, ctypes.c_size_t
     signatures = {
-        "shim_new": ([ctypes.c_char_p, ctypes.c_char_p, *[u32] * 6], handle),
+        "shim_new": ([ctypes.c_char_p, ctypes.c_char_p, *[u32] * 7], handle),
         "shim_interrupt": ([handle, u32], None),
         "shim_free": ([handle], None),
         "shim_entropy": ([handle, ctypes.POINTER(u32), size], None),
@@ -120,6 +121,7 @@ def load(path):
         "shim_set_inputs": ([handle, u32], None),
         "shim_trigger": ([handle, u64], None),
         "shim_set_head": ([handle, u32], None),
+        "shim_fault_mirror": ([handle, u32], None),
         "shim_stick": ([handle, u32, u32], None),
         "shim_take_output": ([handle, ctypes.c_char_p], size),
         "shim_traces": ([handle, ctypes.POINTER(size)], ctypes.POINTER(Trace)),
@@ -156,6 +158,7 @@ class CBoard:
             settings.window_pulses,
             settings.key_edge,
             INTERFACES.index(settings.interface),
+            settings.feedback_codes,
         )
         source = random.Random(1)
         values = entropy or [source.getrandbits(32) for _ in range(256)]
@@ -253,6 +256,11 @@ class CBoard:
     def set_head(self, status):
         """Set the status that the scan head returns, 0 for none."""
         self._library.shim_set_head(self._handle, status)
+
+    def inject_fault(self, kind, now_us):
+        """Break mirror x in one of MIRROR_FAULTS, or repair it: ''."""
+        self.advance(now_us)
+        self._library.shim_fault_mirror(self._handle, ("", *MIRROR_FAULTS).index(kind))
 
     def stick(self, stuck, on=False):
         """Freeze the gate's readback at `on`, or release it."""

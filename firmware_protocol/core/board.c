@@ -129,6 +129,12 @@ static enum fault watch_head(struct board *b, uint64_t now_us) {
     return was_ready && !is_head_ready(b) ? FAULT_HEAD : FAULT_NONE;
 }
 
+/* B17: a mirror that ceases to follow is a fault; one that does not follow at power-up only prevents arming. Returns the fault. */
+static enum fault watch_mirrors(struct board *b, uint64_t now_us) {
+    bool followed = b->follows;
+    return !measure_mirrors(b, now_us) && followed && MUTANT != 112 ? FAULT_SCAN : FAULT_NONE;
+}
+
 /* Starts the job that awaits an edge, if one came since its START_ON_TRIGGER. Several edges between two ticks count, but only
    the last one has a time. */
 static void watch_trigger(struct board *b, uint64_t now_us) {
@@ -169,15 +175,16 @@ static void watch_readback(struct board *b, uint64_t now_us) {
     }
 }
 
-/* Inputs and head are read before points are carried out, so that no pulse begins in the tick that sees an unsafe one. */
+/* Inputs, head and mirrors are read before points are carried out, so that no pulse begins in the tick that sees an unsafe one. */
 void board_tick(struct board *b, uint64_t now_us) {
     watch_tick(b, now_us);
     watch_readback(b, now_us);
-    enum fault input_fault = watch_inputs(b), head_fault = watch_head(b, now_us);
+    enum fault input_fault = watch_inputs(b), head_fault = watch_head(b, now_us), scan_fault = watch_mirrors(b, now_us);
     watch_trigger(b, now_us);
     advance(b, now_us);
-    if (input_fault != FAULT_NONE || head_fault != FAULT_NONE) {
-        enter_fault(b, input_fault != FAULT_NONE ? input_fault : head_fault);
+    enum fault fault = input_fault != FAULT_NONE ? input_fault : head_fault != FAULT_NONE ? head_fault : scan_fault;
+    if (fault != FAULT_NONE) {
+        enter_fault(b, fault);
     }
     guards_tick(&b->guards, &b->limits, &b->config, b->now_us);
 #if MUTANT != 15
@@ -335,6 +342,8 @@ void board_init(struct board *b, const struct board_hal *hal, const struct board
     b->now_us = b->epoch_us = b->settled_us = b->last_tick_us = now_us;
     b->reset_cause = (uint8_t)cause;
     b->x = b->y = CENTRE;
+    b->follows = config->feedback_codes == 0;
+    b->settled_us += b->follows ? 0 : settling_us(&b->limits, CENTRE);
     hal->move_mirrors(hal->context, b->x, b->y); /* their position after a reset is unknown */
     b->inputs = hal->read_inputs(hal->context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
     b->triggers_read = b->triggers_before = hal->read_triggers(hal->context, &b->trigger_us);

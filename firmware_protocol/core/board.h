@@ -56,6 +56,8 @@ struct board_hal {
     uint8_t (*read_inputs)(void *context); /* INPUT_ bits */
     /* Whether a valid status of the scan head came since the last call, and its word; never called on an analog board. */
     bool (*read_head)(void *context, uint16_t *status);
+    /* The mirrors' measured positions in codes, also beyond 0 to 65535; never called without feedback_codes. */
+    void (*read_position)(void *context, int32_t *x, int32_t *y);
     uint32_t (*read_triggers)(void *context, uint64_t *last_us); /* edges so far, and the time of the last one if any */
     void (*set_indicator)(void *context, bool on);
     void (*set_relay)(void *context, bool closed);
@@ -87,6 +89,7 @@ struct board_config {
     uint16_t cells, window_pulses; /* at least 1; BOARD_CELLS and BOARD_PULSES where they state more */
     bool key_edge;
     uint8_t interface; /* enum interface */
+    uint16_t feedback_codes; /* a measured position this far from the commanded one is fault SCAN; 0: none is measured */
 };
 
 enum reset_cause { RESET_POWER_UP, RESET_RESET, RESET_BROWN_OUT, RESET_WATCHDOG };
@@ -196,6 +199,9 @@ struct board {
 
     uint64_t head_us; /* of the tick that read its last status */
     uint16_t head;    /* the status, 0: none */
+
+    int32_t measured_x, measured_y; /* of the mirrors, codes */
+    bool follows;                   /* both mirrors, when last measured and settled */
 
     uint64_t last_tick_us, readback_at_us;
     uint64_t readback_differs_us[2]; /* by commanded level: how long it has differed since it last agreed */

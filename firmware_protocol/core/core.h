@@ -10,7 +10,7 @@
    loop run through points while the tick is late (B14), 105 a pulse begin in the tick that sees an unsafe input (B9), and
    106 each agreement of the readback excuse the gate's other level (B14); 107 lets an edge before START_ON_TRIGGER start
    its job, 108 a job await its trigger without end, 109 delay_us count from the tick that noticed the edge, 110 each edge
-   restart the delay. */
+   restart the delay; 111 lets a pulse begin beside its position, 112 only a pulse's begin looks at the mirrors (B17). */
 #ifndef MUTANT
 #define MUTANT 0
 #endif
@@ -103,8 +103,12 @@ enum fault find_input_fault(uint8_t unsafe);
 uint8_t find_unsafe_inputs(uint8_t inputs);
 /* B16: returns whether the mirrors' scan head is ready; one that returns no status by its interface counts as ready. */
 bool is_head_ready(const struct board *b);
-/* B9, B16: returns the fault for which no pulse may begin now, FAULT_NONE if there is none. */
-enum fault find_unsafe(const struct board *b);
+/* B17: measures the mirrors; returns whether both follow their command. While a move settles, the last answer stands. */
+bool measure_mirrors(struct board *b, uint64_t now_us);
+/* B7: returns the settling time of a move. */
+uint32_t settling_us(const struct board_limits *limits, uint32_t codes);
+/* B9, B16, B17: returns the fault for which no pulse may begin now, FAULT_NONE if there is none. */
+enum fault find_unsafe(struct board *b);
 /* Encodes a message of the session; returns the number of bytes, 0 without a session. */
 size_t encode_message(const struct board *b, uint8_t *wire, uint8_t type, const uint8_t *body, size_t n);
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n);

@@ -9,9 +9,10 @@
 #define CAPABILITY_KEY_EDGE 1u
 #define CAPABILITY_XY2_100 2u
 #define CAPABILITY_EXACT_WIDTHS 4u
+#define CAPABILITY_FEEDBACK 8u
 #define MS 1000u
 
-static bool inputs_safe(const struct board *b) { return find_unsafe_inputs(b->inputs) == 0 && is_head_ready(b); }
+static bool inputs_safe(const struct board *b) { return find_unsafe_inputs(b->inputs) == 0 && is_head_ready(b) && b->follows; }
 
 static bool is_armed(const struct board *b) {
     return STATES_ARMED >> b->state & 1u;
@@ -47,7 +48,8 @@ void on_hello(struct board *b, const struct frame *frame) {
     memcpy(body + HELLO_REPLY_UID_AT, b->config.uid, sizeof b->config.uid);
     put_u32(body + HELLO_REPLY_CAPABILITIES_AT, (b->config.key_edge ? CAPABILITY_KEY_EDGE : 0) |
                                                     (b->config.interface == INTERFACE_XY2_100 ? CAPABILITY_XY2_100 : 0) |
-                                                    (b->hal.has_exact_widths ? CAPABILITY_EXACT_WIDTHS : 0));
+                                                    (b->hal.has_exact_widths ? CAPABILITY_EXACT_WIDTHS : 0) |
+                                                    (b->config.feedback_codes > 0 ? CAPABILITY_FEEDBACK : 0));
     put_u32(body + HELLO_REPLY_TICK_HZ_AT, TICK_HZ);
     put_u16(body + HELLO_REPLY_QUEUE_POINTS_AT, b->config.queue_points);
     put_u16(body + HELLO_REPLY_RX_WINDOW_AT, RX_WINDOW);
@@ -74,6 +76,8 @@ static void send_clock_reply(struct board *b, const uint8_t *requested) {
     send_message(b, MESSAGE_CLOCK_REPLY, body, sizeof body);
 }
 
+static uint16_t clip_code(int32_t code) { return (uint16_t)(code < 0 ? 0 : code > UINT16_MAX ? UINT16_MAX : code); }
+
 static void send_status(struct board *b) {
     uint8_t body[STATUS_SIZE];
     body[STATUS_STATE_AT] = b->state;
@@ -89,6 +93,8 @@ static void send_status(struct board *b) {
     put_u64(body + STATUS_LASER_ON_US_AT, b->laser_on_duty_us / 65535u);
     put_u16(body + STATUS_TEMPERATURE_DC_AT, (uint16_t)b->hal.read_temperature_dc(b->hal.context));
     put_u16(body + STATUS_HEAD_AT, b->head);
+    put_u16(body + STATUS_MIRROR_X_AT, clip_code(b->measured_x));
+    put_u16(body + STATUS_MIRROR_Y_AT, clip_code(b->measured_y));
     send_message(b, MESSAGE_STATUS, body, sizeof body);
 }
 

@@ -48,9 +48,10 @@ enum fault {
     FAULT_CELLS = 13,
     FAULT_PULSES = 14,
     FAULT_HEAD = 15,
+    FAULT_SCAN = 16,
 };
-#define FAULT_COUNT 16u
-#define FAULT_NAMES {"", "LINK", "RANGE", "ON_TIME", "DUTY", "MEAN_POWER", "SPOT", "UNDERRUN", "INTERLOCK", "KEY", "ESTOP", "TICK", "READBACK", "CELLS", "PULSES", "HEAD"}
+#define FAULT_COUNT 17u
+#define FAULT_NAMES {"", "LINK", "RANGE", "ON_TIME", "DUTY", "MEAN_POWER", "SPOT", "UNDERRUN", "INTERLOCK", "KEY", "ESTOP", "TICK", "READBACK", "CELLS", "PULSES", "HEAD", "SCAN"}
 
 enum nak {
     NAK_SEQUENCE = 0,
@@ -272,7 +273,9 @@ enum reason {
 #define STATUS_LASER_ON_US_AT 25u
 #define STATUS_TEMPERATURE_DC_AT 33u
 #define STATUS_HEAD_AT 35u
-#define STATUS_SIZE 37u
+#define STATUS_MIRROR_X_AT 37u
+#define STATUS_MIRROR_Y_AT 39u
+#define STATUS_SIZE 41u
 
 #define TRIGGERS_COUNT_AT 0u
 #define TRIGGERS_TICK_AT 4u

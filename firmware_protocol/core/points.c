@@ -7,16 +7,20 @@ bool has_enough_points(const struct board *b) {
     return b->job.active && b->queue.count > 0 && (all_here || b->queue.count >= b->job.watermark);
 }
 
+uint32_t settling_us(const struct board_limits *limits, uint32_t codes) {
+    return limits->settle_us + (uint32_t)(((uint64_t)codes * limits->settle_ns_per_code + 999) / 1000);
+}
+
 /* B7: an interrupted move may have left the mirrors anywhere on its path, so its own settling time counts too. */
 static uint64_t settling_end_us(const struct board *b, const struct point *point) {
     uint32_t along_x = point->x > b->x ? point->x - b->x : b->x - point->x;
     uint32_t along_y = point->y > b->y ? point->y - b->y : b->y - point->y;
-    uint64_t move = along_x > along_y ? along_x : along_y;
+    uint32_t move = along_x > along_y ? along_x : along_y;
     if (move == 0) {
         return b->settled_us;
     }
     uint64_t from_us = b->settled_us > b->now_us ? b->settled_us : b->now_us;
-    return from_us + b->limits.settle_us + (move * b->limits.settle_ns_per_code + 999) / 1000;
+    return from_us + settling_us(&b->limits, move);
 }
 
 static void begin_point(struct board *b) {

@@ -21,9 +21,28 @@ bool is_head_ready(const struct board *b) {
     return MUTANT == 16 || b->config.interface != INTERFACE_XY2_100 || (b->head & HEAD_READY) == HEAD_READY;
 }
 
-enum fault find_unsafe(const struct board *b) {
+static bool is_near(const struct board *b, int32_t measured, uint16_t commanded) {
+    int32_t codes = measured > commanded ? measured - commanded : commanded - measured;
+    return codes <= b->config.feedback_codes;
+}
+
+bool measure_mirrors(struct board *b, uint64_t now_us) {
+    if (b->config.feedback_codes == 0) {
+        return true;
+    }
+    b->hal.read_position(b->hal.context, &b->measured_x, &b->measured_y);
+    if (now_us >= b->settled_us) {
+        b->follows = MUTANT == 17 || (is_near(b, b->measured_x, b->x) && is_near(b, b->measured_y, b->y));
+    }
+    return b->follows;
+}
+
+enum fault find_unsafe(struct board *b) {
     enum fault fault = find_input_fault(find_unsafe_inputs(b->inputs));
-    return fault == FAULT_NONE && !is_head_ready(b) ? FAULT_HEAD : fault;
+    if (fault == FAULT_NONE && !is_head_ready(b)) {
+        return FAULT_HEAD;
+    }
+    return fault == FAULT_NONE && MUTANT != 111 && !measure_mirrors(b, b->now_us) ? FAULT_SCAN : fault;
 }
 
 size_t encode_message(const struct board *b, uint8_t *wire, uint8_t type, const uint8_t *body, size_t n) {

@@ -226,6 +226,9 @@ class Config(Section):
             raise ConflictError("scanner.half_range_codes", self.scanner.half_range_codes, expected)
 
     def _check_interface(self) -> None:
+        if self.scanner.feedback and self.board.is_dac:
+            expected = f"false, as board.transport '{self.board.transport}' measures no mirrors"
+            raise ConflictError("scanner.feedback", "true", expected)
         if self.scanner.interface == "analog":
             return
         if self.board.is_dac:

@@ -229,6 +229,9 @@ class ScannerSection(ServoSection):
     interface: Literal["analog", "xy2-100"] = "analog"
     """How the board moves the mirrors: by two voltages, or by frames of XY2-100. A move takes up to two frames, 20 µs
     that delay_s includes."""
+    feedback: bool = False
+    """Whether the board measures the mirrors by the galvo driver's position outputs, and permits light only where they
+    are: within half a pixel's distance."""
     half_range_codes: int = HALF_RANGE_CODES
     """Codes of the converter from the centre to the end of the range: 32767, for a laser DAC 2047."""
 

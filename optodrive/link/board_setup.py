@@ -44,6 +44,7 @@ def build_port_settings(config: Config) -> PortSettings:
         own_settings = {name: value for name, value in asdict(limits).items() if name not in MIRROR_RANGE}
         own_settings["cell_codes"] = min(SIMULATED_CELL_MAX_CODES, requirements.cell_max_codes)
         own_settings["interface"] = config.scanner.interface
+        own_settings["feedback_codes"] = requirements.feedback_codes
         own_settings["cells"] = max(SIMULATED_CELLS, requirements.pixels)
     address = {field.name: getattr(board, field.name) for field in fields(PortSettings) if hasattr(board, field.name)}
     return PortSettings(**address, own_settings=own_settings)
@@ -88,6 +89,7 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
         baud=config.board.baud,
         uid=config.board.uid,
         interface=config.scanner.interface,
+        feedback=config.scanner.feedback,
         values=ConfiguredValues(
             pitch_m=config.display.pitch_m,
             bandwidth_hz=config.scanner.bandwidth_hz,

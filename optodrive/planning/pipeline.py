@@ -114,7 +114,7 @@ class SequencePlanner:
         # in `max_power_w` of the limiter, which "trim" lowers instead, "delay" moves, and "refuse" raises; for a frame
         # as a whole, in `feasibility/check.py` and `_refuse_late`; for bytes that pass a cap, in
         # `link/proven_points.py`; at the link process, in `_require_allowed` (epoch, pause, arming, damaged bytes); by
-        # the session, if it comes too late; by the board's guards B1 to B16.
+        # the session, if it comes too late; by the board's guards B1 to B17.
         self._sequence, self._dead_pixels = remove_dead_pixels(display, sequence)
         self._heat = heat
         self._policy = policy

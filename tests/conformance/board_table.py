@@ -25,6 +25,7 @@ ENFORCED = {
     "B14": "self-monitoring of tick and gate",
     "B15": "watchdog whose reset turns the gate off",
     "B16": "scan head that is not ready",
+    "B17": "light only while the measured mirrors follow",
 }
 
 

@@ -340,6 +340,30 @@ def b13_lengths_are_not_checked():
     return m, "parse_message", lenient
 
 
+def b17_mirrors_are_only_reported():
+    measure = BoardMachine._measure_mirrors
+    return BoardMachine, "_measure_mirrors", lambda self: measure(self) or True
+
+
+def b17_a_pulse_begins_beside_its_position():
+    begin = BoardMachine._begin_pulse
+
+    def trust(self, point):
+        codes, self._feedback_codes = self._feedback_codes, 0
+        begin(self, point)
+        self._feedback_codes = codes
+
+    return BoardMachine, "_begin_pulse", trust
+
+
+def b17_only_a_pulse_looks_at_the_mirrors():
+    def only_measure(self):
+        self._watched_us = self.now_us
+        self._measure_mirrors()
+
+    return BoardMachine, "_watch_mirrors", only_measure
+
+
 MUTANTS = {
     name: mutant
     for name, mutant in list(globals().items())

@@ -12,7 +12,12 @@ from forked_process import SIMULATED, start_process
 from optodrive.core.clock import MonotonicClock
 
 READ_WAIT_S = 0.005
-NOT_ITS_OWN = {"python": ("B14", "B15", "B16"), **dict.fromkeys(("qemu", "pico", "pico-usb"), ("B16",))}
+NOT_ITS_OWN = {
+    "python": ("B14", "B15", "B16"),
+    "independent": ("B16",),
+    "pico-xy2": ("B17",),
+    **dict.fromkeys(("qemu", "pico", "pico-usb"), ("B16", "B17")),
+}
 """Guards that a kind of board lacks: the simulated one has no tick, readback or watchdog, and most no scan head."""
 
 

@@ -16,11 +16,11 @@ AT_ONCE = 4
 TICK_US = 100
 """The longest period of a board's tick, which carries out what is due."""
 AT_ONCE_BY = ("abort", "disarm", "flush", "hello", "link lost", "reset")
-GUARDS = [f"B{k}" for k in range(1, 17)]
+GUARDS = [f"B{k}" for k in range(1, 18)]
 
 
 class Scenario(NamedTuple):
-    """One requirement. subject: B1 to B16, or a section of PROTOCOL.md."""
+    """One requirement. subject: B1 to B17, or a section of PROTOCOL.md."""
 
     subject: str
     name: str

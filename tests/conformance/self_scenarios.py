@@ -1,6 +1,6 @@
-"""Scenarios of B14 to B16: a board with an internal fault or a broken scan head turns the gate off and reports it."""
+"""Scenarios of B14 to B17: a fault of the board, of its scan head or of a mirror turns the gate off and is reported."""
 
-from bench import BRIGHT, PATIENT, act, here
+from bench import BRIGHT, CENTRE, PATIENT, act, here
 from guard_scenarios import is_off_by
 from link_scenarios import assert_no_session
 from scenario import scenario
@@ -11,7 +11,9 @@ WATCHDOG = 3
 
 def failing(bench, action, *steps, **limits):
     """Run a job of nine seconds and break a part of the board. steps: that follow"""
-    host = bench.ready(act(action), *steps, **BRIGHT, **limits)
+    host = bench.greeted(act(action), *steps, **BRIGHT, **limits)
+    host.pause(0.01)  # for mirrors that are measured, the move to the centre
+    host.arm()
     assert host.play(*[here(10_000, dark_us=10_000, duty=2000)] * 450, end=False) == []
     host.wait(host.board.is_gate_on, "light")
     host.board.next_step()
@@ -126,3 +128,73 @@ def head_that_is_not_ready_at_power_up_prevents_arming_without_a_fault(bench, ac
     repair_head(host)
     assert host.arm().status().state == "ARMED"
     assert board.faults() == ["HEAD"], "the one from before the reset"
+
+
+# --- B17 ------------------------------------------------------------------------------------------------------------
+
+MEASURED = dict(feedback_codes=650)
+LEFT, RIGHT = 22_768, 42_768
+MOVES = [here(4_000, duty=2000, x=x) for x in (LEFT, RIGHT)]
+MIRRORS = {"a mirror that is stuck": "stick_mirror", "a slow mirror": "slow_mirror", "a cut wire": "unplug_mirror"}
+
+
+def repair_mirror(host):
+    """Carry out the step that repairs the mirror, and wait until it is measured where it was sent."""
+    host.board.next_step()
+    host.wait(lambda: host.status().mirror_x in (CENTRE, LEFT, RIGHT), "a mirror where it was sent")
+    host.pause(0.01)  # settled, too
+
+
+@scenario("B17", MIRRORS)
+def mirror_that_does_not_follow_is_a_fault_until_it_does_again(bench, action):
+    """No pulse begins beside its position."""
+    host = bench.greeted(act(action), act("repair"), **BRIGHT, **MEASURED)
+    board = host.board
+    host.pause(0.01)  # the move to the centre
+    host.arm()
+    assert host.play(*MOVES * 400, end=False) == []
+    host.wait(board.is_gate_on, "light")
+    host.pause(0.05)
+    assert board.faults() == []
+    board.next_step()
+    host.wait_for_change("fault")
+    assert board.faults() == ["SCAN"]
+    assert is_off_by(board, board.of("state")[-1])
+    if action == "unplug_mirror":
+        assert host.status().mirror_x == 65535, "out of range"
+    else:
+        host.pause(0.03)  # a slow mirror arrives in the end
+        number = [int(entry["reason"].split()[1]) for entry in board.of("gate") if entry["on"]][-1]
+        is_there = MOVES[number % 2][0] == host.status().mirror_x
+        assert is_there == (action == "stick_mirror"), "light beside its position"
+    assert host.status().fault == "SCAN"
+    if action != "slow_mirror":
+        assert host.send_checked("CLEAR_FAULT") == ["INPUT"]
+    repair_mirror(host)
+    assert (host.status().state, host.status().fault) == ("FAULT", "SCAN"), "latched"
+    assert host.send_checked("CLEAR_FAULT") == []
+    assert host.arm().status().state == "ARMED"
+
+
+@scenario("B17")
+def position_output_cut_during_a_pulse_turns_the_gate_off(bench):
+    host = failing(bench, "unplug_mirror", **MEASURED)
+    host.wait_for_change("fault")
+    assert host.board.faults() == ["SCAN"]
+    assert is_off_by(host.board, host.board.of("state")[-1])
+
+
+@scenario("B17")
+def mirror_that_does_not_follow_at_power_up_prevents_arming_without_a_fault(bench):
+    host = bench.greeted(act("unplug_mirror"), act("reset"), act("repair"), **PATIENT, **MEASURED)
+    board = host.board
+    host.pause(0.01)
+    board.next_step()
+    host.wait_for_change("fault")
+    board.next_step()
+    host.wait(lambda: [state for state, _ in board.states()] == ["DISARMED", "FAULT", "DISARMED"], "the reset")
+    assert host.hello().capabilities & 8
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["INPUT"]
+    repair_mirror(host)
+    assert host.arm().status().state == "ARMED"
+    assert board.faults() == ["SCAN"], "the one from before the reset"

@@ -8,6 +8,7 @@ from board_log import BoardLog
 
 from optodrive.core.clock import ManualClock
 from optodrive.link.simulator.guards import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.measured_mirrors import MIRROR_FAULTS
 
 READ_WAIT_S = 0.005
 ADVANCE_US = 5000
@@ -15,8 +16,9 @@ ADVANCE_US = 5000
 WATCHDOG_US = 50_000
 WATCHDOG_CAUSE = 3
 LATE_TICK_US = 1000
-HEADS = {"silence_head": 0, "fail_head": 0x7D7D, "repair": 0xFDFD}
-"""Status that the scan head then returns: none, one without power, or one in order."""
+HEADS = {"silence_head": 0, "fail_head": 0x7D7D}
+"""Status that the scan head then returns: none, or one without power."""
+HEAD_OK = 0xFDFD
 BYTE_S = 10 / 1_000_000
 """Time of a byte on the line."""
 
@@ -118,6 +120,12 @@ class VirtualBoard(BoardLog):
             self._resumes_us = now_us + LATE_TICK_US
         elif step["do"] in HEADS:
             self.core.set_head(HEADS[step["do"]])
+        elif step["do"] in MIRROR_FAULTS:
+            self.core.inject_fault(step["do"], now_us)
+        elif step["do"] == "repair":
+            self.core.inject_fault("", now_us)
+            if hasattr(self.core, "set_head"):
+                self.core.set_head(HEAD_OK)
         else:
             assert step["do"] == "stick_gate"
             self.core.stick(stuck=True, on=self.core.gate_output)

@@ -45,7 +45,7 @@ SEQUENCED = (
 HELLO_REPLY = ("major", "minor", "host_nonce", "session", "firmware", "uid", "capabilities", "tick_hz", "queue_points")
 HELLO_REPLY += ("rx_window", "cell_codes", "cells", "window_pulses", "reset_cause", *LIMITS)
 STATUS = ("state", "fault", "inputs", "tick", "done_index", "queued", "crc_errors", "format_errors", "seq_errors")
-STATUS += ("underruns", "laser_on_us", "temperature_dc", "head")
+STATUS += ("underruns", "laser_on_us", "temperature_dc", "head", "mirror_x", "mirror_y")
 BOARD = {
     0x81: ("HELLO_REPLY", "BBIHI12sIIHHHHHB" + LIMITS_CODES, HELLO_REPLY),
     0x83: ("CLOCK_REPLY", "IQ", ("host_t", "tick")),
@@ -54,12 +54,12 @@ BOARD = {
     0x92: ("EVENT", "BBBQ", ("state", "fault", "reason", "tick")),
     0x94: ("ARM_CHALLENGE", "II", ("host_nonce", "board_nonce")),
     0x9C: ("TRIGGERS", "IQ", ("count", "tick")),
-    0x98: ("STATUS", "BBBQIHHHHHQhH", STATUS),
+    0x98: ("STATUS", "BBBQIHHHHHQhHHH", STATUS),
 }
 EXECUTED = 0x99
 STATES = ("BOOT", "DISARMED", "ARMING", "ARMED", "RUNNING", "HOLD", "FAULT")
 FAULTS = ("", "LINK", "RANGE", "ON_TIME", "DUTY", "MEAN_POWER", "SPOT", "UNDERRUN", "INTERLOCK", "KEY", "ESTOP")
-FAULTS += ("TICK", "READBACK", "CELLS", "PULSES", "HEAD")
+FAULTS += ("TICK", "READBACK", "CELLS", "PULSES", "HEAD", "SCAN")
 REASONS = ("", "boot", "hello", "arm requested", "armed", "start", "job done", "queue empty", "refilled")
 REASONS += ("hold too long", "disarm", "abort", "link lost", "arming timed out", "fault", "fault cleared", "flush")
 NAKS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")

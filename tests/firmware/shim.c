@@ -22,6 +22,9 @@ struct shim {
     uint8_t inputs;
     uint8_t stuck, stuck_on, gate_on, indicator, relay, interrupted;
     uint16_t x, y, head; /* head: its status, 0: silent */
+    uint16_t from_x, stuck_x;
+    uint64_t moved_us;
+    uint32_t mirror_fault; /* of MIRROR_FAULTS in measured_mirrors.py, from 1; 0: none */
     uint32_t triggers;
     uint64_t trigger_us;
     uint8_t out[OUT_MAX];
@@ -49,6 +52,8 @@ static bool read_gate(void *context) {
 }
 static void move_mirrors(void *context, uint16_t x, uint16_t y) {
     struct shim *s = context;
+    s->from_x = s->x;
+    s->moved_us = s->now_us;
     s->x = x;
     s->y = y;
 }
@@ -62,6 +67,14 @@ static uint32_t read_triggers(void *context, uint64_t *last_us) {
 static bool read_head(void *context, uint16_t *status) {
     *status = ((struct shim *)context)->head;
     return *status != 0;
+}
+static uint16_t mirror_x(const struct shim *s) {
+    return s->mirror_fault == 1 ? s->stuck_x : s->mirror_fault == 2 && s->now_us < s->moved_us + 20000 ? s->from_x : s->x;
+}
+static void read_position(void *context, int32_t *x, int32_t *y) {
+    const struct shim *s = context;
+    *x = s->mirror_fault == 3 ? 72000 : mirror_x(s);
+    *y = s->y;
 }
 static void set_indicator(void *context, bool on) { ((struct shim *)context)->indicator = on; }
 static void set_relay(void *context, bool closed) { ((struct shim *)context)->relay = closed; }
@@ -100,7 +113,8 @@ static void trace(void *context, const struct board_trace *event) {
 }
 
 struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_codes, uint32_t queue_points,
-                      uint32_t cells, uint32_t window_pulses, uint32_t key_edge, uint32_t interface) {
+                      uint32_t cells, uint32_t window_pulses, uint32_t key_edge, uint32_t interface,
+                      uint32_t feedback_codes) {
     struct shim *s = calloc(1, sizeof *s);
     s->head = 0xfdfdu;
     s->inputs = INPUT_INTERLOCK | INPUT_KEY;
@@ -111,6 +125,7 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
                                 .has_exact_widths = true,
                                 .read_inputs = read_inputs,
                                 .read_head = read_head,
+                                .read_position = read_position,
                                 .read_triggers = read_triggers,
                                 .set_indicator = set_indicator,
                                 .set_relay = set_relay,
@@ -130,6 +145,7 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
     s->config.window_pulses = (uint16_t)window_pulses;
     s->config.key_edge = key_edge;
     s->config.interface = (uint8_t)interface;
+    s->config.feedback_codes = (uint16_t)feedback_codes;
     return s;
 }
 
@@ -177,6 +193,10 @@ void shim_trigger(struct shim *s, uint64_t at_us) {
 }
 void shim_set_inputs(struct shim *s, uint32_t inputs) { s->inputs = (uint8_t)inputs; }
 void shim_set_head(struct shim *s, uint32_t status) { s->head = (uint16_t)status; }
+void shim_fault_mirror(struct shim *s, uint32_t fault) {
+    s->stuck_x = s->from_x = mirror_x(s); /* slow from the next move on */
+    s->mirror_fault = fault;
+}
 void shim_stick(struct shim *s, uint32_t stuck, uint32_t on) {
     s->stuck = (uint8_t)stuck;
     s->stuck_on = (uint8_t)on;

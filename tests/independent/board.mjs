@@ -15,6 +15,7 @@ const RECORDS_PER_REPORT = 28;
 const REPORT_DELAY_US = 2000;
 const OFFSET_MAX = 2 ** 32 - 1;
 const TEMPERATURE_DC = 250;
+const clipCode = (code) => Math.min(Math.max(code, 0), 65535);
 const modulo16 = (count) => count % 65536;
 
 /** Firmware: what it knows is lost at a reset. hooks: log(entry), setGate(on); resetCause: as in HELLO_REPLY */
@@ -34,6 +35,8 @@ export class Board {
       {
         log: hooks.log,
         setGate: hooks.setGate,
+        move: hooks.move,
+        readMirrors: hooks.readMirrors,
         send: (name, values) => this.send(name, values),
         record: (...columns) => this.record(...columns),
       },
@@ -109,10 +112,10 @@ export class Board {
     this.output = [];
     const last = this.session;
     while (this.session === last) this.session = randomInt(1, 65536);
-    const { uid, cell_codes, cells, window_pulses, queue_points, key_edge } = this.settings;
+    const { uid, cell_codes, cells, window_pulses, queue_points, key_edge, feedback_codes } = this.settings;
     this.send("HELLO_REPLY", {
       ...machine.limits, major: MAJOR, minor: MINOR, host_nonce, session: this.session, firmware: 1, uid,
-      capabilities: key_edge ? 1 : 0, tick_hz: TICK_HZ, queue_points, rx_window: RX_WINDOW, cell_codes, cells,
+      capabilities: (key_edge ? 1 : 0) + (feedback_codes ? 8 : 0), tick_hz: TICK_HZ, queue_points, rx_window: RX_WINDOW, cell_codes, cells,
       window_pulses, reset_cause: this.resetCause,
     });
   }
@@ -210,6 +213,7 @@ export class Board {
       format_errors: modulo16(errors.format_errors), seq_errors: modulo16(errors.seq_errors),
       underruns: modulo16(machine.underruns), laser_on_us: Math.floor(machine.laserOnTimesDuty / 65535),
       temperature_dc: TEMPERATURE_DC, head: 0,
+      mirror_x: clipCode(machine.measured.x), mirror_y: clipCode(machine.measured.y),
     });
   }
 

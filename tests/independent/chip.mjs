@@ -1,5 +1,5 @@
 // The chip that the firmware runs on, in virtual time: a safety tick, a main loop, an alarm, the gate's pin with its
-// readback, and a watchdog; written from PROTOCOL.md alone: B1, B9, B14 and B15.
+// readback, and a watchdog; written from PROTOCOL.md alone: B1, B9, B14, B15 and B17.
 
 import { Board } from "./board.mjs";
 
@@ -8,6 +8,9 @@ const LATE_US = 500;
 const READBACK_US = 100;
 const LATE_TICK_US = 1000;
 const WATCHDOG_US = 40_000;
+const CENTRE = 32768;
+const SLOW_US = 20_000;
+const DISCONNECTED_CODE = 72_000;
 const CAUSES = { powerUp: 0, reset: 1, watchdog: 3 };
 
 export class Chip {
@@ -19,6 +22,8 @@ export class Chip {
     this.edges = [];
     this.triggers = 0;
     this.isGateOn = false;
+    this.mirrorFault = "";
+    this.commanded = { x: CENTRE, y: CENTRE };
     this.reset(0, CAUSES.powerUp);
   }
 
@@ -43,6 +48,21 @@ export class Chip {
     return this.differingUs[phase] > READBACK_US;
   }
 
+  move(x, y) {
+    this.before = this.commanded;
+    this.commanded = { x, y };
+    this.movedAt = this.now;
+  }
+
+  /** Mirrors that follow at once, unless x is broken. */
+  readMirrors() {
+    const { x, y } = this.commanded;
+    if (this.mirrorFault === "unplug_mirror") return { x: DISCONNECTED_CODE, y };
+    if (this.mirrorFault === "stick_mirror") return { x: this.stuckX, y };
+    const isLate = this.mirrorFault === "slow_mirror" && this.now < this.movedAt + SLOW_US;
+    return { x: isLate ? this.before.x : x, y };
+  }
+
   // --- faults and inputs from outside ---------------------------------------------------------------------------------
 
   setInput(name, value) {
@@ -63,6 +83,11 @@ export class Chip {
     if (fault === "stop_tick") this.isTickStopped = true;
     if (fault === "late_tick") this.tickResumesAt = this.now + LATE_TICK_US;
     if (fault === "stick_gate") this.frozenReadback = this.isGateOn;
+    if (fault.endsWith("_mirror") || fault === "repair") {
+      this.before = this.readMirrors(); // slow from the next move on
+      this.stuckX = this.before.x;
+      this.mirrorFault = fault;
+    }
   }
 
   /** Begin anew: hardware turns the gate off, and all that the firmware knew is lost. */
@@ -80,9 +105,14 @@ export class Chip {
     this.hasTicked = false;
     this.capturedAt = null;
     this.input = [];
-    this.board = new Board(
-      this.settings, { log: this.log, setGate: (on) => this.setGate(on) }, this.inputs, now, cause,
-    );
+    this.move(CENTRE, CENTRE);
+    const hooks = {
+      log: this.log,
+      setGate: (on) => this.setGate(on),
+      move: (x, y) => this.move(x, y),
+      readMirrors: () => this.readMirrors(),
+    };
+    this.board = new Board(this.settings, hooks, this.inputs, now, cause);
   }
 
   // --- time -----------------------------------------------------------------------------------------------------------
@@ -132,6 +162,7 @@ export class Chip {
     this.tickedAt = this.now;
     this.hasTicked = true;
     for (const [name, value] of Object.entries(this.inputs)) machine.setInput(name, value);
+    machine.watchMirrors();
     if (this.sampleReadback()) machine.fail("READBACK");
     if (this.capturedAt !== null) machine.noticeTrigger(this.capturedAt);
     this.capturedAt = null;

@@ -7,11 +7,13 @@ from dataclasses import asdict
 from javascript import HERE, javascript
 from virtual_board import EmulatedBoard, VirtualKind
 
+from optodrive.link.simulator.measured_mirrors import MIRROR_FAULTS
+
 
 class IndependentCore:
     """A process of board_process.mjs. guard: the one that it violates, '' for none."""
 
-    FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate")
+    FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate", *MIRROR_FAULTS, "repair")
 
     def __init__(self, settings, sink, seed=0, guard=""):
         self._sink = sink

@@ -1,4 +1,4 @@
-// States, jobs and points of a board, written from PROTOCOL.md alone: "States", "Arming", "Jobs and points", B1 to B12.
+// States, jobs and points of a board, written from PROTOCOL.md alone: "States", "Arming", "Jobs and points", B1 to B12, B17.
 //
 // Every event is carried out at its own microsecond: run() takes what is due in order of time, and within one tick in the
 // order lease, arming, hold, points.
@@ -23,7 +23,8 @@ const LESS_IS_TIGHTER = [
 const UNSAFE = { interlock: false, key: false, estop: true };
 const CONSUMED = "";
 
-/** The board's activity. hooks: log(entry), send(name, values), setGate(on), record(index, tick, on_us, duty) */
+/** The board's activity. hooks: log(entry), send(name, values), setGate(on), move(x, y), readMirrors(),
+ * record(index, tick, on_us, duty) */
 export class Machine {
   constructor(settings, hooks, inputs, now) {
     this.settings = settings;
@@ -46,7 +47,9 @@ export class Machine {
     this.underruns = 0;
     this.underrunTimes = [];
     this.position = { x: CENTRE, y: CENTRE };
-    this.settledAt = now;
+    this.measured = { x: 0, y: 0 };
+    this.follows = !settings.feedback_codes;
+    this.settledAt = now + (this.follows ? 0 : this.settlingUs(CENTRE));
     this.isGateOn = false;
     this.laserOnTimesDuty = 0;
     this.triggers = { count: 0, tick: 0 };
@@ -111,6 +114,23 @@ export class Machine {
     return Object.entries(UNSAFE).every(([name, unsafe]) => this.inputs[name] !== unsafe);
   }
 
+  /** Measure both mirrors, and tell whether they follow; while a move settles, the last answer stands. */
+  areMirrorsFollowing() {
+    const { feedback_codes } = this.settings;
+    if (!feedback_codes) return true;
+    this.measured = this.hooks.readMirrors();
+    if (this.now >= this.settledAt) {
+      const away = Math.max(...["x", "y"].map((axis) => Math.abs(this.measured[axis] - this.position[axis])));
+      this.follows = away <= feedback_codes;
+    }
+    return this.follows;
+  }
+
+  watchMirrors() {
+    const followed = this.follows;
+    if (!this.areMirrorsFollowing() && followed) this.fail("SCAN");
+  }
+
   lease(durationMs) {
     if (!LEASED.includes(this.state)) return;
     const until = this.now + 1000 * Math.min(durationMs, this.limits.lease_ms);
@@ -134,7 +154,7 @@ export class Machine {
   requestArming(hostNonce) {
     if (this.state !== "DISARMED") return "STATE";
     if (!this.isVersionKnown) return "VERSION";
-    if (!this.areInputsSafe()) return "INPUT";
+    if (!this.areInputsSafe() || !this.follows) return "INPUT";
     if (this.settings.key_edge && !this.keyTurned) return "KEY_EDGE";
     this.change("ARMING", "arm requested");
     this.arming = { since: this.now, hostNonce, boardNonce: randomBytes(4).readUInt32LE(), confirmedAt: null };
@@ -163,7 +183,7 @@ export class Machine {
 
   clearFault() {
     if (this.state !== "FAULT") return "STATE";
-    if (!this.areInputsSafe()) return "INPUT";
+    if (!this.areInputsSafe() || !this.follows) return "INPUT";
     this.fault = "";
     this.underrunTimes = [];
     this.change("DISARMED", "fault cleared");
@@ -300,6 +320,7 @@ export class Machine {
     const distance = Math.max(Math.abs(point.x - this.position.x), Math.abs(point.y - this.position.y));
     this.settledAt = Math.max(this.now, this.settledAt) + this.settlingUs(distance);
     this.position = { x: point.x, y: point.y };
+    this.hooks.move(point.x, point.y);
     this.current = { ...point, isLit: false, onAt: Math.max(this.now + point.dark_us, this.settledAt) };
   }
 
@@ -315,7 +336,7 @@ export class Machine {
       this.endPoint();
       return;
     }
-    const fault = this.accounts.begin(current, this.now, this.limits);
+    const fault = this.areMirrorsFollowing() ? this.accounts.begin(current, this.now, this.limits) : "SCAN";
     if (fault) {
       this.fail(fault);
       return;

@@ -81,6 +81,12 @@ const BREAK = {
   B15: () => {
     Chip.prototype.isWatchdogDue = () => false;
   },
+  B17: () => {
+    machine.areMirrorsFollowing = function trust() {
+      this.follows = true;
+      return true;
+    };
+  },
 };
 
 /** Break a guard of every board of this process. */

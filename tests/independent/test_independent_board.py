@@ -19,7 +19,7 @@ def test_conforms(case):
     judge(independent_kind(), case)
 
 
-@pytest.mark.parametrize("guard", GUARDS)
+@pytest.mark.parametrize("guard", [guard for guard in GUARDS if has_subject("independent", guard)])
 def test_a_board_without_a_guard_is_caught(guard):
     assert caught_by(independent_kind(guard), guard), "passes every scenario of its guard"
 

@@ -10,7 +10,7 @@ export const FRAME_MAX = 254;
 export const STATES = ["BOOT", "DISARMED", "ARMING", "ARMED", "RUNNING", "HOLD", "FAULT"];
 export const FAULTS = [
   "", "LINK", "RANGE", "ON_TIME", "DUTY", "MEAN_POWER", "SPOT", "UNDERRUN", "INTERLOCK", "KEY", "ESTOP", "TICK",
-  "READBACK", "CELLS", "PULSES", "HEAD",
+  "READBACK", "CELLS", "PULSES", "HEAD", "SCAN",
 ];
 export const NAKS = ["SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION"];
 export const REASONS = [
@@ -58,7 +58,8 @@ const MESSAGES = [
     0x98,
     "STATUS",
     "u8 state, u8 fault, u8 inputs, u64 tick, u32 done_index, u16 queued, u16 crc_errors, u16 format_errors, " +
-      "u16 seq_errors, u16 underruns, u64 laser_on_us, i16 temperature_dc, u16 head",
+      "u16 seq_errors, u16 underruns, u64 laser_on_us, i16 temperature_dc, u16 head, u16 mirror_x, " +
+      "u16 mirror_y",
   ),
   message(0x9c, "TRIGGERS", "u32 count, u64 tick"),
   message(0x99, "EXECUTED", "u32 first_index, u64 base_tick", { repeated: ["records", RECORD, RECORDS_MAX] }),

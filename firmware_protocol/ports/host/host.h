@@ -52,6 +52,9 @@ enum step_kind {
     STEP_TRIGGER,    /* an edge at the trigger input */
     STEP_SILENCE_HEAD, /* the scan head returns no status until repair */
     STEP_FAIL_HEAD,    /* its status says that its power is not in order, until repair */
+    STEP_STICK_MIRROR, /* mirror x stays where it is, until repair */
+    STEP_SLOW_MIRROR,  /* mirror x arrives MIRROR_SLOW_US after a move, until repair */
+    STEP_UNPLUG_MIRROR, /* the position output of mirror x is disconnected, until repair */
 };
 
 struct step {
@@ -135,6 +138,9 @@ struct port {
     uint32_t triggers; /* edges so far */
     uint64_t trigger_us;
     uint16_t head; /* its status, 0: silent */
+    uint16_t x, y, from_x, stuck_x;
+    uint64_t moved_us;
+    enum step_kind mirror_fault; /* STEP_SET: none */
     bool gate_on, readback_stuck, readback_value, loop_stopped, tick_stopped;
 };
 

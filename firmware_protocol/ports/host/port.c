@@ -22,6 +22,8 @@
 #define TIMER_SLACK_NS 1000ul
 #define HEAD_OK 0xfdfdu    /* power, temperature, positions */
 #define HEAD_POWER 0x8080u
+#define MIRROR_SLOW_US 20000u
+#define DISCONNECTED_CODE 72000 /* of an input that its pull-up holds beyond the range of positions */
 
 static volatile sig_atomic_t stopped, signals;
 
@@ -53,7 +55,22 @@ static bool read_gate(void *context) {
     const struct port *port = context;
     return port->readback_stuck ? port->readback_value : port->gate_on;
 }
-static void move_mirrors(void *context, uint16_t x, uint16_t y) { (void)context, (void)x, (void)y; }
+static void move_mirrors(void *context, uint16_t x, uint16_t y) {
+    struct port *port = context;
+    port->from_x = port->x;
+    port->moved_us = port->at_us;
+    port->x = x;
+    port->y = y;
+}
+static uint16_t mirror_x(const struct port *port) {
+    bool is_late = port->mirror_fault == STEP_SLOW_MIRROR && port->at_us < port->moved_us + MIRROR_SLOW_US;
+    return port->mirror_fault == STEP_STICK_MIRROR ? port->stuck_x : is_late ? port->from_x : port->x;
+}
+static void read_position(void *context, int32_t *x, int32_t *y) {
+    const struct port *port = context;
+    *x = port->mirror_fault == STEP_UNPLUG_MIRROR ? DISCONNECTED_CODE : mirror_x(port);
+    *y = port->y;
+}
 static void ignore_output(void *context, bool on) { (void)context, (void)on; }
 static uint8_t read_inputs(void *context) { return ((struct port *)context)->inputs; }
 static bool read_head(void *context, uint16_t *status) {
@@ -156,6 +173,7 @@ static void run_step(struct port *port, const struct step *step) {
         port->line.drop_rate = port->line.flip_rate = 0;
         port->line.hung = port->readback_stuck = false;
         port->head = HEAD_OK;
+        port->mirror_fault = STEP_SET;
         break;
     case STEP_RESET:
         port->line.output_count = 0;
@@ -184,6 +202,12 @@ static void run_step(struct port *port, const struct step *step) {
         break;
     case STEP_FAIL_HEAD:
         port->head = HEAD_OK & ~HEAD_POWER;
+        break;
+    case STEP_STICK_MIRROR:
+    case STEP_SLOW_MIRROR:
+    case STEP_UNPLUG_MIRROR:
+        port->stuck_x = port->from_x = mirror_x(port); /* slow from the next move on */
+        port->mirror_fault = step->kind;
         break;
     case STEP_STICK_GATE:
         port->readback_value = port->gate_on;
@@ -293,6 +317,7 @@ void port_run(struct port *port) {
         .move_mirrors = move_mirrors,
         .read_inputs = read_inputs,
         .read_head = read_head,
+        .read_position = read_position,
         .read_triggers = read_triggers,
         .set_indicator = ignore_output,
         .set_relay = ignore_output,

@@ -7,10 +7,11 @@
 static const char *const INPUTS[INPUT_COUNT] = INPUT_NAMES;
 static const char *const ACTIONS[] = {"",       "flip_bits", "drop_bytes", "hang",      "repair",
                                       "reset",  "close",     "stop_loop",  "stop_tick", "late_tick", "stick_gate",
-                                      "trigger", "silence_head", "fail_head"};
+                                      "trigger", "silence_head", "fail_head", "stick_mirror", "slow_mirror", "unplug_mirror"};
 #define ACTION_NAMES \
-    "one of flip_bits, drop_bytes, hang, repair, reset, close, trigger; of this board alone: stop_loop, stop_tick, late_tick, " \
-    "stick_gate, silence_head, fail_head"
+    "one of flip_bits, drop_bytes, hang, repair, reset, close, trigger, stick_mirror, slow_mirror, " \
+    "unplug_mirror; of this board alone: stop_loop, stop_tick, late_tick, stick_gate, " \
+    " silence_head, fail_head"
 
 const char *input_name(uint8_t bit) {
     for (size_t k = 0; k < INPUT_COUNT; k++) {

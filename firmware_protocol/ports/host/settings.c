@@ -83,6 +83,8 @@ static bool read_entry(struct board_config *config, const char *path, const stru
         config->cells = (uint16_t)read_integer(path, entry, 1, BOARD_CELLS);
     } else if (strcmp(entry->key, "window_pulses") == 0) {
         config->window_pulses = (uint16_t)read_integer(path, entry, 1, BOARD_PULSES);
+    } else if (strcmp(entry->key, "feedback_codes") == 0) {
+        config->feedback_codes = (uint16_t)read_integer(path, entry, 0, UINT16_MAX);
     } else if (strcmp(entry->key, "uid") == 0) {
         read_uid(config, path, entry);
     } else if (strcmp(entry->key, "key_edge") == 0) {
@@ -109,7 +111,7 @@ void settings_read(struct board_config *config, const char *path) {
 #define NAME(name, bits, at, way) #name ", "
             bad_input(path, toml->entries[k].key,
                       "a known key: one of " LIMITS_FIELDS(NAME) "uid, cell_codes, queue_points, cells, window_pulses, key_edge, "
-                      "interface");
+                      "interface, feedback_codes");
         }
     }
     if (toml->tables) {

@@ -34,13 +34,14 @@ FAULTS = (
     "CELLS",
     "PULSES",
     "HEAD",
+    "SCAN",
 )
 NAK_REASONS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")
 NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
 """NAK reasons after which the host resends the same frame. Any other reason consumes the frame's sequence number."""
 EVENT_REASONS = tuple(EventReason)
 INPUTS = ("interlock", "key", "estop")
-CAPABILITY_KEY_EDGE, CAPABILITY_XY2_100, CAPABILITY_EXACT_WIDTHS = 1, 2, 4
+CAPABILITY_KEY_EDGE, CAPABILITY_XY2_100, CAPABILITY_EXACT_WIDTHS, CAPABILITY_FEEDBACK = 1, 2, 4, 8
 HEAD_BITS = {0x8000: "power", 0x4000: "temperature"}
 """Bits of a ready scan head's status, and what is in order then."""
 
@@ -342,7 +343,7 @@ class Event(
 
 
 @dataclass(frozen=True)
-class Status(Message, name="STATUS", type_id=0x98, layout="<BBBQIHHHHHQhH", enums={"state": STATES, "fault": FAULTS}):
+class Status(Message, name="STATUS", type_id=0x98, layout="<BBBQIHHHHHQhHHH", enums={"state": STATES, "fault": FAULTS}):
     """Report state, inputs and counters of the board."""
 
     state: int
@@ -358,6 +359,8 @@ class Status(Message, name="STATUS", type_id=0x98, layout="<BBBQIHHHHHQhH", enum
     laser_on_us: int
     temperature_dc: int
     head: int
+    mirror_x: int
+    mirror_y: int
 
 
 @dataclass(frozen=True)

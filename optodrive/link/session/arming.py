@@ -95,7 +95,7 @@ class BoardRequirements:
     pixels: number of pixels that its spot guards must tell apart
     lease_s: time for which the board may emit without a renewal by the host
     baud: bit rate of the port, 1/s; uid: the only board that is accepted, hexadecimal, '' for any
-    interface: by which the board moves the mirrors, of the configuration
+    interface: by which the board moves the mirrors, of the configuration; feedback: whether it must measure them
     """
 
     limits: m.Limits
@@ -106,7 +106,13 @@ class BoardRequirements:
     baud: int
     uid: str
     interface: str
+    feedback: bool
     values: ConfiguredValues
+
+    @property
+    def feedback_codes(self) -> int:
+        """Codes that a measured mirror may be away from its command, 0 if none is measured."""
+        return self.cell_max_codes // 2 if self.feedback else 0
 
     @property
     def max_in_flight_bytes(self) -> int:
@@ -140,6 +146,9 @@ class BoardRequirements:
                 raise InputError("laser.modulation", values.modulation, f"'pwm': {own}", "board")
             if not values.whole_periods:
                 raise InputError("laser.whole_periods", values.whole_periods, f"True: {own}", "board")
+        if self.feedback and not peer.capabilities & m.CAPABILITY_FEEDBACK:
+            expected = "false, as this board does not measure the mirrors (by `optodrive board build`)"
+            raise InputError("scanner.feedback", "true", expected, "board")
         if peer.tick_hz != TICK_HZ:
             raise InputError("board tick_hz", peer.tick_hz, f"{TICK_HZ}", "board")
         limits, requested = peer.limits, self.limits

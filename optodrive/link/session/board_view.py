@@ -20,6 +20,7 @@ FAULT_HINTS = {
     "INTERLOCK": "the interlock opened: close the enclosure",
     "KEY": "the key was turned off: turn it on",
     "ESTOP": "the emergency stop was pressed: release it",
+    "SCAN": "a mirror did not follow: check the plugs of driver and position outputs, and the supply of the driver",
     "HEAD": "the scan head returned no valid status, or one without power or temperature OK: check its plug and supply",
 }
 

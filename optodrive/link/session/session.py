@@ -3,7 +3,7 @@
 Theory of operation
 
 Problem. A board that can emit stands at the end of a line that loses, damages and delays bytes, beside a host that may
-stall or restart. The board protects itself (rules B1 to B16 of the protocol); the session must never undo that
+stall or restart. The board protects itself (rules B1 to B17 of the protocol); the session must never undo that
 protection, and must tell its owner the truth about the board. Handshake, clocks, reports of the board's state and
 statistics stand in `board_link.py`, which gives nobody light.
 

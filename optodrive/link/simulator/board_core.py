@@ -16,6 +16,7 @@ from optodrive.link.protocol.framing import Frame, encode_frame
 from optodrive.link.protocol.states import BoardState, EventReason
 from optodrive.link.simulator.board_machine import BoardMachine, LogSink, MirrorSink
 from optodrive.link.simulator.guards import INTERFACES, BoardSettings
+from optodrive.link.simulator.measured_mirrors import MeasuredMirrors, MirrorSource
 
 WANDER_PERIOD_S = 600.0
 
@@ -58,6 +59,7 @@ class BoardCore:
     """A board from power-up on.
 
     sink: receives each log event as a dict with its time t_us; mirror_sink: receives each move of the mirrors
+    mirror_source: where the mirrors are, None for mirrors that follow at once
     seed: of session numbers and nonces, None for unpredictable ones
     """
 
@@ -67,6 +69,7 @@ class BoardCore:
         sink: LogSink | None = None,
         seed: int | None = None,
         mirror_sink: MirrorSink | None = None,
+        mirror_source: MirrorSource | None = None,
     ) -> None:
         self._settings = settings or BoardSettings()
         self._is_digital = self._settings.interface != INTERFACES[0]
@@ -74,9 +77,14 @@ class BoardCore:
         self._random = random.Random(seed)
         self.read_present_us: Callable[[], int] = lambda: self.machine.now_us
         """Present time. A process that ran late processes bytes as of the time at which a board would have got them."""
-        self.machine = BoardMachine(
-            self._settings, self._random, self._sink, mirror_sink or (lambda x, y, at_us: None), self._send
-        )
+        self.mirrors = MeasuredMirrors(mirror_source)
+
+        def move(x: int, y: int, at_us: int) -> None:
+            self.mirrors.move_to(x, y, at_us)
+            if mirror_sink is not None:
+                mirror_sink(x, y, at_us)
+
+        self.machine = BoardMachine(self._settings, self._random, self._sink, move, self.mirrors.read, self._send)
         self._power_up(reset_cause=0)
 
     def _power_up(self, reset_cause: int) -> None:
@@ -122,6 +130,11 @@ class BoardCore:
         """Change an input: interlock (True: closed), key (True: on), estop (True: pressed)."""
         self.advance(now_us)
         self.machine.set_input(name, value)
+
+    def inject_fault(self, kind: str, now_us: int) -> None:
+        """Break mirror x in one of MIRROR_FAULTS, or repair it: ''."""
+        self.advance(now_us)
+        self.mirrors.inject_fault(kind, now_us)
 
     def receive_trigger(self, now_us: int) -> None:
         """Receive a rising edge at the trigger input."""
@@ -247,7 +260,8 @@ class BoardCore:
                 uid=bytes.fromhex(self._settings.uid),
                 capabilities=m.CAPABILITY_EXACT_WIDTHS
                 + m.CAPABILITY_KEY_EDGE * self._settings.key_edge
-                + m.CAPABILITY_XY2_100 * self._is_digital,
+                + m.CAPABILITY_XY2_100 * self._is_digital
+                + m.CAPABILITY_FEEDBACK * (self._settings.feedback_codes > 0),
                 tick_hz=TICK_HZ,
                 queue_points=self._settings.queue_points,
                 rx_window=WINDOW,
@@ -292,6 +306,8 @@ class BoardCore:
             laser_on_us=machine.laser_on_duty_us // 65535,
             temperature_dc=TEMPERATURE_DC,
             head=HEAD_OK if self._is_digital else 0,
+            mirror_x=machine.measured_codes[0],
+            mirror_y=machine.measured_codes[1],
         )
 
     def _send(self, message: m.Message) -> None:

@@ -1,7 +1,7 @@
 """The simulated board's state machine: arming, points and guards in virtual time, without the link.
 
-It enforces B1 to B11 of PROTOCOL.md. Time is whole microseconds and advances only when the caller says so; each due
-event is carried out, and logged, at its exact time.
+It enforces B1 to B11 and B17 of PROTOCOL.md. Time is whole microseconds and advances only when the caller says so;
+each due event is carried out, and logged, at its exact time.
 """
 
 from collections import deque
@@ -27,6 +27,8 @@ HOLD_MAX_US = 1_000_000
 UNDERRUNS_MAX = 3
 UNDERRUN_WINDOW_US = 10_000_000
 INDEX_MAX = 0xFFFF_FFFF
+WATCH_US = 500
+"""Time between two measurements of the mirrors."""
 CENTRE_CODE = 32768
 SAFE_INPUTS = {"interlock": True, "key": True, "estop": False}
 INPUT_FAULTS = {"interlock": "INTERLOCK", "key": "KEY", "estop": "ESTOP"}
@@ -35,6 +37,8 @@ LogSink = Callable[[dict[str, Any]], None]
 """Receives each log event, with its time t_us."""
 MirrorSink = Callable[[int, int, int], None]
 """Receives each move of the mirrors: target codes of x and y, and the time in µs."""
+MirrorReader = Callable[[int], tuple[float, float]]
+"""Returns the measured codes of x and y at a time in µs."""
 EventSink = Callable[[m.Event], None]
 """Receives the EVENT of each change of state."""
 
@@ -48,11 +52,13 @@ class BoardMachine:
         rng: Random,
         log_sink: LogSink,
         mirror_sink: MirrorSink,
+        mirror_reader: MirrorReader,
         event_sink: EventSink,
     ) -> None:
         self._settings = settings
         self._random = rng
         self._log_sink, self._mirror_sink, self._event_sink = log_sink, mirror_sink, event_sink
+        self._read_mirrors, self._feedback_codes = mirror_reader, settings.feedback_codes
         self.now_us = 0
         self.inputs = dict(SAFE_INPUTS)
         self.gate = False
@@ -71,7 +77,10 @@ class BoardMachine:
         self._guards = EmissionGuards(self._settings.cell_codes, self._settings.cells, self._settings.window_pulses)
         self._position = (CENTRE_CODE, CENTRE_CODE)
         self._mirror_sink(*self._position, self.now_us)
-        self._settled_us = self.now_us
+        self._follows = not self._feedback_codes
+        self._settled_us = self.now_us + (0 if self._follows else self._compute_settling_us(CENTRE_CODE))
+        self._watched_us = self.now_us
+        self.measured_codes = 0, 0
         self._current_point: QueuedPoint | None = None
         self._gate_on_us = self._due_us = 0
         self._board_nonce: int | None = None
@@ -100,6 +109,7 @@ class BoardMachine:
     def next_event_us(self) -> int | None:
         """Return the time of the next due event, None if there is none."""
         due = [self._point_due_us(), self._lease_due_us(), self._arming_due_us(), self._hold_due_us()]
+        due.append(self._watch_due_us())
         return min((at_us for at_us in due if at_us is not None), default=None)
 
     def advance(self, now_us: int) -> None:
@@ -119,6 +129,8 @@ class BoardMachine:
             self._finish_arming()
         elif self._is_due(self._hold_due_us()):
             self.disarm(EventReason.HOLD_TOO_LONG)
+        elif self._is_due(self._watch_due_us()):
+            self._watch_mirrors()
         else:
             self._advance_point()
 
@@ -143,6 +155,9 @@ class BoardMachine:
             return job.expires_us
         return None if self.queue.has_enough_points else job.start_us + HOLD_MAX_US
 
+    def _watch_due_us(self) -> int | None:
+        return self._watched_us + WATCH_US if self._feedback_codes else None
+
     def _point_due_us(self) -> int | None:
         if self.state != BoardState.RUNNING:
             return None
@@ -152,6 +167,28 @@ class BoardMachine:
         if job is None or job.trigger_delay_us is not None or not self.queue.has_enough_points:
             return None
         return max(job.start_us, self.now_us)
+
+    # --- mirrors ------------------------------------------------------------------------------------------------
+
+    def _compute_settling_us(self, codes: int) -> int:
+        return self.limits.settle_us + -(-codes * self.limits.settle_ns_per_code // 1000)
+
+    def _measure_mirrors(self) -> bool:
+        """Return whether both mirrors follow their command. While a move settles, the last answer stands."""
+        if not self._feedback_codes:
+            return True
+        measured = self._read_mirrors(self.now_us)
+        if self.now_us >= self._settled_us:
+            away = max(abs(code - at) for code, at in zip(measured, self._position, strict=True))
+            self._follows = away <= self._feedback_codes
+        self.measured_codes = clip_code(measured[0]), clip_code(measured[1])
+        return self._follows
+
+    def _watch_mirrors(self) -> None:
+        self._watched_us = self.now_us
+        followed = self._follows
+        if not self._measure_mirrors() and followed:
+            self._enter_fault("SCAN")
 
     # --- points -------------------------------------------------------------------------------------------------
 
@@ -168,15 +205,17 @@ class BoardMachine:
     def _begin_point(self, point: QueuedPoint) -> None:
         move = max(abs(point.x - self._position[0]), abs(point.y - self._position[1]))
         if move:
-            settling_us = self.limits.settle_us + -(-move * self.limits.settle_ns_per_code // 1000)
             # An interrupted move may have left the mirrors anywhere on its path: its own settling time counts too.
-            self._settled_us = max(self._settled_us, self.now_us) + settling_us
+            self._settled_us = max(self._settled_us, self.now_us) + self._compute_settling_us(move)
         self._position = point.x, point.y
         self._mirror_sink(point.x, point.y, self.now_us)
         self._current_point = point
         self._due_us = max(self.now_us + point.dark_us, self._settled_us)
 
     def _begin_pulse(self, point: QueuedPoint) -> None:
+        if not self._measure_mirrors():
+            self._enter_fault("SCAN")
+            return
         fault = self._guards.check_pulse(self.limits, point.x, point.y, self.now_us, point.on_us, point.duty)
         if fault:
             self._enter_fault(fault)
@@ -278,6 +317,10 @@ class BoardMachine:
         self._confirmed = False
         self._board_nonce = None
 
+    @property
+    def _is_safe(self) -> bool:
+        return self.inputs == SAFE_INPUTS and self._follows
+
     def set_input(self, name: str, value: bool) -> None:
         """Change an input: interlock (True: closed), key (True: on), estop (True: pressed)."""
         if name == "key" and value and not self.inputs["key"]:
@@ -299,7 +342,7 @@ class BoardMachine:
         """Acknowledge a fault and forget the underruns."""
         if self.state != BoardState.FAULT:
             return "STATE"
-        if self.inputs != SAFE_INPUTS:
+        if not self._is_safe:
             return "INPUT"
         self.fault = ""
         self._underrun_times_us.clear()
@@ -334,7 +377,7 @@ class BoardMachine:
             return "STATE"
         if not self._is_version_supported:
             return "VERSION"
-        if self.inputs != SAFE_INPUTS:
+        if not self._is_safe:
             return "INPUT"
         if self._settings.key_edge and not self._key_turned:
             return "KEY_EDGE"
@@ -454,3 +497,8 @@ class BoardMachine:
 
     def _log(self, event: str, **fields: object) -> None:
         self._log_sink({"t_us": self.now_us, "event": event, **fields})
+
+
+def clip_code(code: float) -> int:
+    """Return the code of a converter nearest to a measured one."""
+    return min(max(round(code), 0), 0xFFFF)

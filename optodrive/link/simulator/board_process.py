@@ -81,7 +81,13 @@ def main(
     clock = BoardClock(1e-6 * options.clock_ppm, 1e-6 * options.clock_wander_ppm)
     simulated = build_core is BoardCore
     if simulated:
-        build_core = partial(BoardCore, seed=options.seed, mirror_sink=optics.galvos.move_to if optics else None)
+        galvos = optics.galvos if optics else None
+        build_core = partial(
+            BoardCore,
+            seed=options.seed,
+            mirror_sink=galvos.move_to if galvos else None,
+            mirror_source=galvos.measure if galvos else None,
+        )
     board = PtyBoard(
         options.pty, log, settings, script, options.baud, options.exit_when_closed, build_core, actions, optics, clock
     )

@@ -77,6 +77,11 @@ class SimulatedGalvos:
         x_rad, y_rad = self.angles_rad(at_us)
         return CENTRE_CODE + x_rad / self._scale.rad_per_code, CENTRE_CODE + y_rad / self._scale.rad_per_code
 
+    def measure(self, at_us: int) -> FloatArray:
+        """Return the noisy codes of outputs X and Y that the position outputs show."""
+        codes = CENTRE_CODE + np.array(self.position_output_rad(at_us)) / self._scale.rad_per_code
+        return np.array(self._scale.to_outputs(codes[0], codes[1]))
+
     def position_output_rad(self, at_us: int) -> tuple[float, float]:
         """Return the noisy position outputs of x and y, rad."""
         sign = -1.0 if self.readback_inverted else 1.0

@@ -34,7 +34,7 @@ INTERFACES = ("analog", "xy2-100")
 """How a board tells the mirrors their position."""
 CELLS_MAX, WINDOW_PULSES_MAX = 8192, 8192
 SETTING_RANGES |= {"cell_codes": (1, 0xFFFF), "queue_points": (POINTS_MAX, 0xFFFF)}
-SETTING_RANGES |= {"cells": (1, CELLS_MAX), "window_pulses": (1, WINDOW_PULSES_MAX)}
+SETTING_RANGES |= {"feedback_codes": (0, 0xFFFF), "cells": (1, CELLS_MAX), "window_pulses": (1, WINDOW_PULSES_MAX)}
 UPPER_LIMITS = ("max_on_us", "max_duty", "mean_duty", "spot_uj", "spot_leak_uw", "x_max", "y_max", "lease_ms")
 LOWER_LIMITS = ("x_min", "y_min", "settle_us", "settle_ns_per_code", "rest_us")
 
@@ -52,6 +52,7 @@ class BoardSettings:
 
     cell_codes: of a cell, in codes; cells: accounts in each grid; window_pulses: pulses in a second
     interface: one of INTERFACES; the head of a simulated board is always ready
+    feedback_codes: a measured position this far from the commanded one is fault SCAN; 0: none is measured
     """
 
     limits: Limits = DEFAULT_LIMITS
@@ -62,6 +63,7 @@ class BoardSettings:
     window_pulses: int = WINDOW_PULSES_MAX
     key_edge: bool = False
     interface: str = "analog"
+    feedback_codes: int = 0
 
 
 def load_settings(path: Path) -> BoardSettings:

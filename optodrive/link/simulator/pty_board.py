@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
 from optodrive.link.simulator.board_core import EXACT_CLOCK, BoardClock, BoardCore
 from optodrive.link.simulator.guards import BoardSettings
+from optodrive.link.simulator.measured_mirrors import MIRROR_FAULTS
 from optodrive.link.simulator.pseudo_terminal import READ_MAX, FaultyLink, LineRate, open_pty, remove_link
 from optodrive.link.simulator.script import SENSOR_ACTIONS, ScriptStep
 
@@ -286,14 +287,21 @@ class PtyBoard:
             self._core.receive_trigger(now_us)
         elif step.name == "repair":
             self._faults.repair()
+            self._inject_mirror_fault("", now_us)
         elif step.name == "close":
             self._on_port_closed(now_us)
             os.close(self._master)
             self._open_pty()
         elif step.name in self._actions:
             self._actions[step.name](self._core)
+        elif step.name in MIRROR_FAULTS:
+            self._inject_mirror_fault(step.name, now_us)
         elif step.name in SENSOR_ACTIONS:
             if self._optics is not None:
                 self._optics.inject_fault(step.name, now_us)
         else:
             self._faults.inject_fault(step.name, step.rate)
+
+    def _inject_mirror_fault(self, fault: str, now_us: int) -> None:
+        if isinstance(self._core, BoardCore):
+            self._core.inject_fault(fault, now_us)

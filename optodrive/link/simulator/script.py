@@ -7,7 +7,8 @@ value = false
 
 [[step]]
 at_s = 2.0
-do = "flip_bits"       # or "drop_bytes" (both with rate), "hang", "repair", "reset", "close", "trigger"
+do = "flip_bits"       # or "drop_bytes" (both with rate), "hang", "repair", "reset", "close", "trigger",
+                       # "stick_mirror", "slow_mirror", "unplug_mirror"
 rate = 0.01
 
 With from = "light", at_s counts from the first pulse; with from = "signal", a step has no at_s, and each SIGUSR1 to the
@@ -24,11 +25,12 @@ from typing import Any, Literal, get_args
 from optodrive.core.errors import MISSING, InputError, suggest_nearest
 from optodrive.core.toml_model import read_toml
 from optodrive.link.protocol.messages import INPUTS
+from optodrive.link.simulator.measured_mirrors import MIRROR_FAULTS
 
 SENSOR_ACTIONS = ("stick_x", "stick_y", "invert_readback", "blind_sensor", "unplug_sensor")
 """Faults of mirrors and spot sensor."""
 Origin = Literal["start", "light", "signal"]
-ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", "trigger", *SENSOR_ACTIONS)
+ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", "trigger", *MIRROR_FAULTS, *SENSOR_ACTIONS)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.protocol.transcript import PENDING_MAX, Transcript, describe, describe_reset_cause
 
 DATA = m.Data(7, m.POINT.pack(1, 2, 3, 4, 65535) * 2)
-STATUS = m.Status(4, 1, 0b101, 99, 3, 2, 1, 0, 0, 0, 12, 253, 0)
+STATUS = m.Status(4, 1, 0b101, 99, 3, 2, 1, 0, 0, 0, 12, 253, 0, 0, 0)
 
 
 def wire(message, seq=0, session=5):

@@ -24,7 +24,7 @@ QUEUE_POINTS = 60
 HELLO = m.HelloReply(1, 0, 5, 7, 1, bytes(12), 0, 1_000_000, QUEUE_POINTS, 8, 1, 9, 9, 0, DEFAULT_LIMITS)
 TICK = round(BOARD_S / TICK_S)
 ARMED, FAULT = m.STATES.index("ARMED"), m.STATES.index("FAULT")
-STATUS = m.Status(ARMED, 0, 3, TICK, 20, 30, 0, 0, 0, 0, 4000, 250, 0)
+STATUS = m.Status(ARMED, 0, 3, TICK, 20, 30, 0, 0, 0, 0, 4000, 250, 0, 0, 0)
 EVENT = m.Event(ARMED, 0, 0, TICK)
 ACK = m.Ack(3, QUEUE_POINTS, 20, ARMED)
 

@@ -281,6 +281,13 @@ def test_widths_in_microseconds_are_refused_for_a_board_that_does_not_promise_th
     Rig(config=config).connect()
 
 
+def test_a_board_that_does_not_measure_the_mirrors_is_refused_where_it_must():
+    requirements = build_board_requirements(changed("scanner", feedback=True))
+    requirements.check_board(replace(FITS, capabilities=m.CAPABILITY_FEEDBACK))
+    with pytest.raises(InputError, match=r"scanner\.feedback: got 'true', expected false, as this board does not"):
+        requirements.check_board(FITS)
+
+
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
 def test_the_simulated_board_meets_the_requirements_of_every_display(name):
     Rig(config=DISPLAYS[name].config).connect().arm()
