@@ -15,6 +15,7 @@ from optodrive.study.report import StudyResults
 from optodrive.study.trial_table import compute_group_mean, read_tables
 from study_tables import LEVELS, answer_levels, write_table, write_thresholds
 
+NOTEBOOK = Path(__file__).parents[3] / "docs" / "examples" / "analyse_study.ipynb"
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "analyse_study.py"
 THREE = ("1", "2", "3")
 STUDY = """
@@ -213,7 +214,29 @@ def compare_with_the_script(folder, task, report):
     return script
 
 
-def test_a_design_with_levels_has_its_thresholds_everywhere(tmp_path, capsys):
+def compare_with_the_notebook(folder, task, report, monkeypatch):
+    """Assert that the notebook finds the accuracies and thresholds of a report."""
+    monkeypatch.setenv("STUDY_FOLDER", str(folder))
+    monkeypatch.setenv("STUDY_TASK", task)
+    cells = json.loads(NOTEBOOK.read_text())["cells"]
+    found = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), found)
+    for name, one in report["participants"].items():
+        row = found["accuracy"].loc[name]
+        assert (row["correct"], row["trials"]) == (one["accuracy"]["correct"], one["accuracy"]["trials"])
+        assert (row["low"], row["high"]) == pytest.approx(one["accuracy"]["interval"], abs=1e-9)
+    for key in ("mean", "low", "high"):
+        assert found["group"][key] == pytest.approx(report["group"]["accuracy"][key])
+    assert len(found["thresholds"]) == len(report["thresholds"])
+    for row, one in zip(found["thresholds"].to_dict("records"), report["thresholds"], strict=True):
+        assert row["is_within_levels"] == (one["threshold"] is not None)
+        assert all(one[key] is None or row[key] == pytest.approx(one[key], rel=1e-6) for key in ("threshold", "low"))
+        assert one["high"] is None or row["high"] == pytest.approx(one["high"], rel=1e-6)
+
+
+def test_a_design_with_levels_has_its_thresholds_everywhere(tmp_path, capsys, monkeypatch):
     assert run(["study", "gap-detection", "--out", str(tmp_path), "--participants", "2", "--json"]) == 0
     stated = json.loads(capsys.readouterr().out)
     assert run(["study", "report", str(tmp_path), "--json"]) == 0
@@ -222,6 +245,7 @@ def test_a_design_with_levels_has_its_thresholds_everywhere(tmp_path, capsys):
     compare_with_the_script(tmp_path, "gapdetection", report)
     for one in report["thresholds"]:
         assert all(stated["thresholds"][one["participant"]][key] == one[key] for key in ("threshold", "low", "high"))
+    compare_with_the_notebook(tmp_path, "gapdetection", report, monkeypatch)
     page = (tmp_path / "derivatives" / "task-gapdetection_report.html").read_text()
     assert page.count("share correct by gap_ms") >= 2
     assert "gap_ms" in (tmp_path / "derivatives" / "task-gapdetection_trials.tsv").read_text().splitlines()[0].split()
