@@ -1,6 +1,6 @@
 """Recording as one vector of finite samples, in blocks of one signal of one run each, and its hypotheses."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -160,6 +160,22 @@ class Dataset:
         experiments = [(self.blocks[max(blocks)].run, experiment) for experiment, blocks in self.experiments]
         kept = [(numbers[run], experiment) for run, experiment in experiments if run in numbers]
         return assemble_dataset(tuple(self.runs[old] for old in runs), samples, kept)
+
+    def drop_ends(self, counts: Mapping[int, int]) -> "Dataset":
+        """Return the data without this number of samples at both ends of each block [by block], but with their times.
+
+        Half of the samples of a block stay at least.
+        """
+        samples = []
+        for number, block in enumerate(self.blocks):
+            size = len(block.sampled_s)
+            count = min(counts.get(number, 0), size // 4)
+            used = (block.rows >= count) & (block.rows < size - count)
+            value = self.value[block.part][used]
+            if len(value):
+                samples.append(Samples(block.run, block.kind, block.pixel, block.t_s[used], value, block.sampled_s))
+        experiments = [(self.blocks[max(blocks)].run, experiment) for experiment, blocks in self.experiments]
+        return assemble_dataset(self.runs, samples, experiments)
 
 
 def build_dataset(measurement: Measurement) -> Dataset:

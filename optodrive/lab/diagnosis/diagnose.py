@@ -60,6 +60,7 @@ from optodrive.lab.diagnosis.model_selection import (
     has_replicate_excess,
 )
 from optodrive.lab.diagnosis.next_steps import propose_for_verdict
+from optodrive.lab.diagnosis.noise_model import drop_averaged_ends
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, compute_intra_pulse_power_excess, fit_nominal, update_noise
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.lab.diagnosis.recording_checks import check_copied_runs, check_numeric_limits, check_recording_units
@@ -222,10 +223,11 @@ def _diagnose_subsystem(
     nothing: tuple[tuple[InstrumentDisturbance, ...], FloatArray] = ((), np.zeros(len(data.value)))
     # Sought in all runs, held-out ones too: they are subtracted from the data, and no model gains by them.
     disturbances, added = log.attempt("disturbances of instruments", _find_disturbances, nothing, data, problem, base)
-    # The noise was estimated with the disturbance in it, so everything begins again without.
-    if disturbances:
-        log.on_progress("nominal model without the instruments' disturbances")
-        data = remove_disturbances(data, added)
+    # The noise was estimated with these in it, so everything begins again without.
+    clean = drop_averaged_ends(remove_disturbances(data, added) if disturbances else data, problem.noise)
+    if clean is not data:
+        log.on_progress("nominal model without what instruments did to signals and to their ends")
+        data = clean
         fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
         problem, base = fit_nominal(fitted_data, prior, min_timing_sigma_s, shared)
     # An AC coupling leaves no zero that differs from run to run; where one does, that explanation is out.

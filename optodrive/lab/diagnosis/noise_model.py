@@ -33,7 +33,7 @@ not contain, or an effect shifts the jitters' sensitivities). Above a threshold 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import cos, exp, log, pi, sin, sqrt
+from math import ceil, cos, exp, log, pi, sin, sqrt
 
 import numpy as np
 from scipy.optimize import minimize
@@ -59,6 +59,9 @@ RESOLUTION_SHARE = 5e-5
 its integrator agree to 2e-5."""
 ROUNDING_S = 0.02
 """Duration for which the rounding error of a settled signal without noise persists."""
+AVERAGED_ENDS = 1.5
+"""Samples left out at the ends of a signal that was averaged, relative to the number in a mean, which is known to a
+quarter."""
 MAX_LAG = 40
 """Samples over which correlations of whitened samples are looked at."""
 
@@ -208,6 +211,19 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, sensitivity: Jitte
             baseline_sigma[kind] = max(baseline_sigma[kind], error)
     model = NoiseModel(coloured, power_sigma, timing_sigma_s, baseline_sigma, True, has_noise=repeats_differ)
     return replace(model, replicate_excess=_compute_replicate_excess(contrasts, model))
+
+
+def drop_averaged_ends(data: Dataset, noise: NoiseModel) -> Dataset:
+    """Return the data without the ends of signals that a program averaged, or the data itself.
+
+    Every program continues a signal beyond its ends in its own way: by zeros, by the last sample, mirrored, or not.
+    """
+    counts = {}
+    for number, block in enumerate(data.blocks):
+        window = find_window(block.t_s, noise.coloured[block.kind].windows)
+        if window is not None and window.count > 1:
+            counts[number] = ceil(AVERAGED_ENDS * window.reach)
+    return data.drop_ends(counts) if counts else data
 
 
 def _compute_replicate_excess(contrasts: list[Contrast], model: NoiseModel) -> float:

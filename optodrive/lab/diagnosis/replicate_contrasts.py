@@ -133,10 +133,14 @@ def _match_nearest(first: FloatArray, times: FloatArray) -> IntArray:
 
 @dataclass(frozen=True)
 class NoiseWindow:
-    """Number of samples over which noise is smooth, of a signal that is sampled at this interval [s]."""
+    """Number of samples over which noise is smooth, of a signal that is sampled at this interval [s].
+
+    reach: samples in a moving mean of such noise, not rounded to a power of two
+    """
 
     interval_s: float
     count: int
+    reach: float = 1.0
 
 
 Windows = tuple[NoiseWindow, ...]
@@ -155,13 +159,18 @@ def find_windows(contrasts: list[Contrast]) -> Windows:
         values = item.value - item.jitter @ np.linalg.lstsq(item.jitter, item.value, rcond=None)[0]
         classes.setdefault(round(4.0 * np.log2(interval_s)), []).append((interval_s, values))
     return tuple(
-        NoiseWindow(float(np.median([interval_s for interval_s, _ in members])), _count_smooth(members))
+        NoiseWindow(float(np.median([interval_s for interval_s, _ in members])), *_count_smooth(members))
         for members in classes.values()
     )
 
 
-def _count_smooth(members: list[tuple[float, FloatArray]]) -> int:
-    """Return the number of samples, a power of two, at which the noise of these contrasts stops to be smooth."""
+def _count_smooth(members: list[tuple[float, FloatArray]]) -> tuple[int, float]:
+    """Return `count` and `reach` of the window at which the noise of these contrasts stops to be smooth.
+
+    Second differences of means of n samples with the step k have a variance of 4 k / n up to k = n / 2, of 8 k / n − 2
+    up to k = n, and of 6 from there on.
+    """
+    # Windows are powers of two.
     count, longest = 1, max(len(values) for _, values in members)
     # Longer windows would leave too few means to estimate the noise from.
     while count < min(MAX_WINDOW, longest // 8):
@@ -173,9 +182,9 @@ def _count_smooth(members: list[tuple[float, FloatArray]]) -> int:
         ]
         before, after = np.sum(spreads, axis=0)
         if not after > MIN_GROWTH * before > 0.0:
-            break
+            return count, 8.0 * count / (6.0 * before / after + 2.0) if count > 1 else 1.0
         count *= 2
-    return count
+    return count, float(count)
 
 
 def average_windows(t_s: FloatArray, columns: FloatArray, windows: Windows) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from optodrive.device.servo import simulate_servo
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity, compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.model_selection import MAX_INTRA_PULSE_POWER_EXCESS, MAX_REPLICATE_EXCESS
-from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, whiten
+from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, drop_averaged_ends, whiten
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.replicate_contrasts import (
     Contrast,
@@ -216,3 +216,27 @@ def test_a_smoothed_signal_does_not_let_repeats_differ(change, terms):
     noise = fit_nominal(build_dataset(Measurement(tuple(runs))))[0].noise
     assert noise.replicate_excess < MAX_REPLICATE_EXCESS
     assert noise.intra_pulse_power_excess < MAX_INTRA_PULSE_POWER_EXCESS
+
+
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("count", [9, 15, 21, 25, 31])
+def test_what_is_kept_of_averaged_signals_does_not_depend_on_how_a_program_continues_them(count, late):
+    rng, t_s = np.random.default_rng(count), 1e-3 * np.arange(600)
+    values = [120.0 * np.clip((t_s - 0.2) / 0.008, 0.0, 1.0) + rng.standard_normal(600) for _ in range(6)]
+    kept, windows = [], ()
+    for mode in ("nearest", "constant", "mirror"):
+        runs = []
+        for number, value in enumerate(values):
+            mean = uniform_filter1d(value, count, mode=mode, origin=count // 2 if late else 0)
+            signals = {"displacement_m": Signal(0, t_s, mean)}
+            runs.append(Run(f"r{number}", AMBIENT_K, np.zeros((0, 4)), signals, {"group": "one"}))
+        data = build_dataset(Measurement(tuple(runs)))
+        nothing = JitterSensitivity(*2 * [np.zeros(len(data.value))])
+        windows = windows or find_windows(compute_contrasts(data, data.value, nothing))
+        noise = NoiseModel({1: replace(NOISE, windows=windows)}, 0.0, 0.0, {1: 0.0}, True)
+        kept.append(drop_averaged_ends(data, noise))
+        assert drop_averaged_ends(data, replace(noise, coloured={1: NOISE})) is data
+    assert [len(block.sampled_s) for block in kept[0].blocks] == [600] * 6
+    assert 2 * count <= 600 - len(kept[0].blocks[0].t_s) <= 6 * count
+    for other in kept[1:]:
+        assert other.value == pytest.approx(kept[0].value, abs=1e-9)
