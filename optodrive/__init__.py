@@ -1,3 +1,3 @@
 """Driver of a tactile display driven by projected light."""
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"

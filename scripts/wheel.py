@@ -8,7 +8,6 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-import venv
 from pathlib import Path
 
 import httpx
@@ -25,12 +24,12 @@ def build_wheel(folder):
     return wheel
 
 
-def install_wheel(wheel, folder, quick):
+def install_wheel(wheel, folder, quick, base=sys.executable):
     """Install the wheel and its dependencies into an empty environment. Return the path of its `optodrive`.
 
-    With `quick`, the dependencies of the current environment are used.
+    With `quick`, the dependencies of the current environment are used. `base` is the interpreter.
     """
-    venv.create(folder, with_pip=False)
+    subprocess.run([base, "-m", "venv", "--without-pip", folder], check=True)
     python = folder / "bin" / "python"
     target = f"{wheel}" if quick else f"{wheel}[analysis]"
     subprocess.run([*PIP, "--python", python, "install", "-q", *(["--no-deps"] if quick else []), target], check=True)
@@ -86,6 +85,7 @@ def main():
     parser = argparse.ArgumentParser(prog="scripts/wheel", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="use the libraries of the current environment")
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder of the wheel")
+    parser.add_argument("--python", default=sys.executable, help="interpreter of the environment; not with --quick")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     for old in options.out.glob("optodrive-*.whl"):
@@ -94,7 +94,8 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         outside = Path(folder) / "outside"
         outside.mkdir()
-        result = try_installation(install_wheel(wheel, Path(folder) / "environment", options.quick), outside)
+        installed = install_wheel(wheel, Path(folder) / "environment", options.quick, options.python)
+        result = try_installation(installed, outside)
     print(json.dumps({"wheel": str(wheel), "bytes": wheel.stat().st_size, **result}))
     return 0 if result["planned"] == 1 and result["status"] == 0 and len(result["configs"]) == 5 else 1
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from optodrive import __version__
 from optodrive.cli.invocation import SUMMARY, Invocation
 from optodrive.cli.signals import INTERRUPTED, report_interruption
 from optodrive.core.daemon_url import check_environment
@@ -149,9 +150,7 @@ def build_app(command: str | None = None) -> typer.Typer:
 
 def _print_version(requested: bool) -> None:
     if requested:
-        from importlib.metadata import version
-
-        print(f"optodrive {version('optodrive')}")
+        print(f"optodrive {__version__}")
         raise typer.Exit
 
 

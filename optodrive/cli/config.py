@@ -138,13 +138,19 @@ def _list_section(table: dict[str, Any], name: str) -> Iterator[str]:
 
 
 @GROUP.command()
-def check(config: ConfigOption = None, json: JsonOption = False) -> None:
+def check(
+    file: Annotated[str | None, typer.Argument(metavar="[FILE]", help="The same as --config FILE.")] = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
     """Check a configuration file and the files that it names. Tokens are checked only for the daemon's user."""
     from optodrive.daemon.api.tokens import read_private_tokens
     from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel
 
-    display = DisplayModel.from_config(load_config(config))
+    if file is not None and config is not None:
+        raise InputError("FILE", file, "FILE or --config, not both")
+    display = DisplayModel.from_config(load_config(file or config))
     tokens = display.config.daemon.tokens
     if tokens and os.access(tokens, os.R_OK):
         read_private_tokens(Path(tokens))

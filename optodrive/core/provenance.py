@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
-from importlib.metadata import version
 from shlex import join
 from typing import Any
+
+from optodrive import __version__
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Provenance:
         """
         name, text = (None, None) if configuration is None else configuration
         return cls(
-            version("optodrive"),
+            __version__,
             datetime.now(UTC).isoformat(timespec="seconds"),
             join(["optodrive", *arguments]),
             name,

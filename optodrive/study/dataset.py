@@ -6,10 +6,10 @@ task under `sub-ID/beh`. Tables are always written anew from the logs, so that a
 
 import json
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from optodrive import __version__
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.files import create_folder, lock_folder, read_regular_file, write_text
 from optodrive.core.numeric_tables import escape_formula
@@ -289,7 +289,7 @@ def _describe_task(study: Study) -> dict[str, Any]:
             "EqualInterval": None if study.procedure is None else study.procedure.equal_interval,
             "Factors": [name for name in study.varied if study.procedure is None or name != study.procedure.parameter],
         },
-        "StimulusPresentation": {"SoftwareName": "optodrive", "SoftwareVersion": version("optodrive")},
+        "StimulusPresentation": {"SoftwareName": "optodrive", "SoftwareVersion": __version__},
         "Design": study.model_dump(mode="json"),
     }
 
@@ -309,7 +309,7 @@ def _describe_dataset() -> dict[str, Any]:
         "Name": "Tactile studies on an optotactile display",
         "BIDSVersion": BIDS_VERSION,
         "DatasetType": "raw",
-        "GeneratedBy": [{"Name": "optodrive", "Version": version("optodrive")}],
+        "GeneratedBy": [{"Name": "optodrive", "Version": __version__}],
     }
 
 

@@ -5,13 +5,13 @@ import re
 from dataclasses import replace
 from datetime import datetime, timedelta
 from hashlib import sha256
-from importlib.metadata import version
 
 import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 
 from labs import lab
+from optodrive import __version__
 from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.measurements import Measurement
@@ -431,7 +431,7 @@ def test_the_report_states_its_provenance(droop):
     text = build_report(droop, "droop.h5", provenance)
     for entry in (
         "optodrive diagnose &#x27;my droop.h5&#x27;",
-        version("optodrive"),
+        __version__,
         provenance.created_at,
         f"mine, SHA-256 {digest}",
     ):

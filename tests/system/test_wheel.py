@@ -1,8 +1,9 @@
-"""The wheel, installed into an empty environment: its contents, and the daemon from it outside the checkout."""
+"""The distributions: equal bits from one source, all contents, and the daemon from the wheel outside the checkout."""
 
 import json
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "scripts"))
 
-from wheel import build_wheel  # noqa: E402 - a script
+from release import build_twice, find_differences  # noqa: E402 - a script
 
 
 def made(tmp_path, *options):
@@ -22,9 +23,13 @@ def made(tmp_path, *options):
 
 
 @pytest.mark.timeout(300)
-def test_everything_is_inside(tmp_path):
-    with zipfile.ZipFile(build_wheel(tmp_path)) as wheel:
-        inside = set(wheel.namelist())
+def test_two_builds_are_equal_and_everything_is_inside(tmp_path):
+    source, wheel = sorted(build_twice(tmp_path), key=lambda path: path.suffix)
+    with tarfile.open(source) as archive:
+        listed = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"LICENSE", "SECURITY.md", "scripts/release.py", "tests/system/test_wheel.py"} <= listed
+    with zipfile.ZipFile(wheel) as archive:
+        inside = set(archive.namelist())
     folders = ("configs", "docs", "firmware_protocol")
     files = (path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file())
     shipped = {path.relative_to(ROOT).as_posix() for path in files if "__pycache__" not in path.parts}
@@ -33,6 +38,11 @@ def test_everything_is_inside(tmp_path):
     own = {path.relative_to(ROOT).as_posix() for path in (ROOT / "optodrive").rglob("*") if path.is_file()}
     assert {path for path in own if "__pycache__" not in path} <= inside  # modules, the page, py.typed
     assert not [path for path in inside if path.startswith(("tests", "scripts", "firmware"))]
+
+
+def test_a_build_that_differs_is_found():
+    assert find_differences({"a": "1", "b": "2"}, {"a": "1", "b": "2"}) == []
+    assert find_differences({"a": "1", "b": "2"}, {"a": "1", "b": "3", "c": "4"}) == ["b", "c"]
 
 
 @pytest.mark.slow  # its kernels are compiled anew, too

@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib.metadata import version
 from itertools import pairwise
 from math import ceil, sqrt
 from typing import Any
 
+from optodrive import __version__
 from optodrive.core.document import Document, Markup, Section, Table
 from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_quantity
@@ -143,7 +143,7 @@ def build_display_answer(answer: DisplayAnswer) -> dict[str, Any]:
         "pixels": {str(item.pixel): _build_entry(item) for item in answer.pixels},
         "mirrors": None if answer.mirrors is None else _build_entry(answer.mirrors),
         "elapsed_s": answer.elapsed_s,
-        "version": version("optodrive"),
+        "version": __version__,
     }
 
 

@@ -1,9 +1,9 @@
 """Diagnosis as narrative text, as JSON, and as a parameter file that planner and daemon load unchanged."""
 
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from typing import Any
 
+from optodrive import __version__
 from optodrive.core.document import to_json
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.discrepancy import Discrepancy, Estimate, HeightError, ResidualTrace
@@ -185,7 +185,7 @@ def build_answer(found: Discrepancy) -> dict[str, Any]:
         "runs": {"fitted": list(found.fitted_runs), "held_out": list(found.held_out_runs)},
         "remarks": list(found.remarks),
         "elapsed_s": found.elapsed_s,
-        "version": version("optodrive"),
+        "version": __version__,
     }
 
 

@@ -31,6 +31,8 @@ def test_the_file_is_that_of_the_display(tmp_path, capsys):
     assert (config.display.pitch_m, config.laser.max_power_w, config.scanner.focal_length_m) == (4e-3, 1.2, 0.16)
     assert (config.board.transport, config.limits.display_mean_power_max_w) == ("simulated", 1.2)
     assert run(["config", "check", "--config", str(path)]) == 0
+    assert run(["config", "check", str(path)]) == 0
+    assert run(["config", "check", str(path), "--config", str(path)]) == 2
     named = [line for line in path.read_text().splitlines() if "=" in line]
     assert sum("#" in line for line in named) > len(named) / 2, "most keys have a comment"
 

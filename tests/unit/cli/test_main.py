@@ -2,11 +2,11 @@
 
 import socket
 import termios
-from importlib.metadata import version
 
 import pytest
 import typer
 
+from optodrive import __version__
 from optodrive.cli import commands
 from optodrive.cli.main import run
 from optodrive.client.exchange import Endpoint
@@ -22,7 +22,7 @@ def tokenless(monkeypatch, tmp_path):
 
 def test_the_version_is_printed(capsys):
     assert run(["--version"]) == 0
-    assert capsys.readouterr().out == f"optodrive {version('optodrive')}\n"
+    assert capsys.readouterr().out == f"optodrive {__version__}\n"
 
 
 def test_without_a_daemon_no_token_is_asked_for(tokenless, capsys):
