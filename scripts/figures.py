@@ -25,13 +25,14 @@ SHOWN = {
     "wire": r".",
     "board": r"simulated board",
     "hour": r"one hour|over kernel|difference",
-    "order": r"(full|50 at random|braille).*(second, (naive|sched)|bound, sched|fraction by)|experiment-6.*scheduler",
+    "order": r"(full|50 at random|braille).*(second, (naive|sched)|bound, sched)|experiment-6.*scheduler",
     "field": r"(289|25) spots: rms.*worst geometry|289 spots.*two sigma|positions to codes",
     "page": r"all heights|frames per second|executed|underruns",
-    "memory": r"at rest|first answer",
+    "memory": r"all processes|first answer",
     "stream": r"^(?!.*truncates).*(first light|^(WebSocket: )?arrival to first byte|^round trip.*bare|"
     r"frame of (200|1511).*, limited|shown per second of (20|60|200)|underruns)",
-    "stop": r"gate off|after STOP",
+    "stop": r"gate off, (rest|refused bodies|slow bodies|idle|connection|callers|fragmented|telemetry that is not)|"
+    r"^rest: pulses after STOP",
     "fingers": r"dots under|first light",
 }
 """Rows of each benchmark that the page shows, by a pattern within their quantity."""
