@@ -136,6 +136,7 @@ def test_a_cause_is_found_beside_a_mean_of_past_samples_at_two_intervals():
 def test_a_mean_of_a_thermometers_samples_is_found_where_samples_lie_at_edges_and_are_missing():
     found = diagnose(average_samples("absorber_temperature_K", 11, 0, {}, (2000.0, 487.0)))
     assert (found.verdict, found.causes, found.disturbances) == ("cause", ("smoothing",), ())
+    assert any("the ends of its runs" in remark for remark in found.remarks)
     assert found.parameters["smoothing.temperature"].value == pytest.approx(0.011, rel=0.005)
     assert found.parameters["smoothing.order"].value == pytest.approx(0.0, abs=0.02)
 

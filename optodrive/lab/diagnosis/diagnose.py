@@ -385,6 +385,13 @@ def _find_shared_terms(subsystems: list[_SubsystemFit]) -> dict[str, TermValues]
 def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
     out = []
     for subsystem in subsystems:
+        noise = subsystem.problem.noise.coloured
+        averaged = [SIGNALS[kind] for kind in noise if any(window.count > 1 for window in noise[kind].windows)]
+        out += [
+            f"{name}: noise of neighbouring samples is alike, as a mean or a filter leaves it: the ends of its runs, "
+            "which a program computes from samples that it lacks, are left out."
+            for name in averaged
+        ]
         if subsystem.problem.noise.replicate_excess > MAX_REPLICATE_EXCESS:
             out.append(
                 "Repeats of one experiment differ by far more than noise and jitter: something changes from run to run."
