@@ -16,18 +16,24 @@ def terms(
 ) -> None:
     """List the terms of model.toml, or show one: equation, parameters, ranges, and a model.toml that states it."""
     from optodrive.physics.term_reference import build_example_file, describe_term
-    from optodrive.physics.terms import discover_terms
+    from optodrive.physics.terms import discover_terms, load_plug_ins
 
     known = discover_terms()
+    broken = load_plug_ins().broken
+    if name is not None and name in broken:
+        raise InputError("TERM", name, f"one that can be used ({broken[name]})", code="broken_plug_in")
     if name is not None and name not in known:
         raise InputError("TERM", name, f"a known term, {suggest_nearest(name, sorted(known))}")
     if json:
         selected = [known[key] for key in sorted(known) if name in (None, key)]
-        print_json({"terms": [describe_term(term) for term in selected]})
+        reasons = {"broken": broken} if broken and name is None else {}
+        print_json({"terms": [describe_term(term) for term in selected]} | reasons)
         return
     if name is None:
         for key in sorted(known):
             print(f"{key:<22}{known[key].label}")
+        for key, reason in broken.items():
+            print(f"{key:<22}cannot be used ({reason})")
         print("\n`optodrive terms TERM` shows the parameters of one.")
         return
     term = known[name]

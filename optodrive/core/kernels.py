@@ -288,6 +288,15 @@ def array_kernel(function: Callable[P, T]) -> Callable[P, T]:
     return _cache(compile_here(function, counts_references=True), function, counts_references=True)
 
 
+def compile_signature(function: Any, returns: bool) -> None:
+    """Compile a kernel of a term before its first use.
+
+    returns: whether its last argument is the number that it returns changed, in place of an array that it writes to
+    """
+    array = numba.float64[::1]
+    function.compile((array, array, numba.int64, array, numba.float64 if returns else array))
+
+
 _njit: Any = numba.njit  # numba's types lack _nrt
 
 

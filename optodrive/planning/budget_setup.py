@@ -12,7 +12,8 @@ from optodrive.device.field_loader import build_settling_table
 from optodrive.device.panel import Neighbours, complete_panel
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_HEAT_GAIN, HeatGainBound, OperatingEnvelope, TermValues
-from optodrive.physics.terms import all_terms
+from optodrive.physics.term_plug_ins import changes_heat
+from optodrive.physics.terms import all_terms, load_plug_ins
 from optodrive.physics.terms.thermal import compute_capacity
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels, HeatBound
 from optodrive.planning.limiter.caps import CAPS, CapScale, CapValues
@@ -187,6 +188,14 @@ def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnve
     uniform_rise_k = absorber_age_s = 0.0
     for key in terms:
         if key in BOUNDED_TERMS:
+            continue
+        if key in load_plug_ins().found:
+            # Its own statements are not tested here, so that a cap may not rest on them.
+            if changes_heat(all_terms()[key]):
+                expected = (
+                    "a term of optodrive, or one without a kernel of light or heat: no test proves another's bound"
+                )
+                raise InputError(f"terms.{key}", key, expected)
             continue
         term_gain = all_terms()[key].bound_heat_gain(terms[key], envelope)
         if term_gain is None:

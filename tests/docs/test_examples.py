@@ -60,7 +60,7 @@ ELSEWHERE = {
     "optodrive token": "tests/unit/cli/test_token_command.py",
     "optodrive plan frames.json --pixel-map": "tests/accuracy/test_calibrate_pixels.py",
     "optodrive simulate sweep/": "tests/accuracy/test_calibrate_pixels.py",
-    "pip install ./lab-patterns": "tests/system/test_pattern_plug_ins.py installs it",
+    "pip install ./lab-optodrive": "tests/system/test_plug_ins.py installs it",
     "optodrive diagnose film.h5 --out cluster/ --dask": "tests/accuracy/test_display_diagnosis.py starts a cluster",
 }
 """Beginnings of examples that are not run here, and where they are."""
@@ -72,7 +72,6 @@ SCENARIOS = {
     "readme": (write_checkout, ["README.md:Shell", "README.md:Python"]),
     "readme-rest": (write_checkout, ["README.md:REST"]),
     "patterns": (write_stimuli, ["docs/how-to/show-stimuli.md:Patterns"]),
-    "plug-ins": (write_checkout, ["docs/how-to/add-a-pattern.md:Patterns of your own"]),
     "fits": (write_checkout, ["docs/how-to/show-stimuli.md:Whether it fits"]),
     "refusals": (write_recordings, ["docs/reference/recordings.md:Refusals"]),
     "unusable": (write_recordings, ["docs/reference/recordings.md:What cannot be used"]),

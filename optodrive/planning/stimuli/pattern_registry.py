@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import cache
-from importlib.metadata import entry_points
-from typing import NamedTuple
 
 import numpy as np
 from pydantic import TypeAdapter
 
 from optodrive.core.errors import InputError, OptodriveError, build_nothing_raised_error, suggest_nearest
+from optodrive.core.plug_ins import PlugIns, find_plug_ins
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import Config
 from optodrive.planning.stimuli import experiments, images, shapes
@@ -362,32 +361,17 @@ PLUG_INS = "optodrive.patterns"
 """Group of the entry points by which other packages offer patterns."""
 
 
-class PlugIns(NamedTuple):
-    """Patterns of other packages by name, and why others cannot be used, by name."""
-
-    patterns: Mapping[str, Pattern]
-    broken: Mapping[str, str]
-
-
 @cache
-def load_plug_ins() -> PlugIns:
-    """Import the patterns of other packages. One that cannot be imported or is no pattern costs only itself."""
-    patterns: dict[str, Pattern] = {}
-    broken: dict[str, str] = {}
-    for point in entry_points(group=PLUG_INS):
-        package = point.dist.name if point.dist is not None else point.value
-        try:
-            patterns[point.name] = _check_plug_in(point.name, point.load(), package, patterns)
-        except (Exception, SystemExit) as error:  # the code of others
-            broken[point.name] = f"{package}: {type(error).__name__}: {' '.join(str(error).split())}"
-    return PlugIns({name: each for name, each in patterns.items() if name not in broken}, broken)
+def load_plug_ins() -> PlugIns[Pattern]:
+    """Return the patterns of other packages."""
+    return find_plug_ins(PLUG_INS, _check_plug_in)
 
 
-def _check_plug_in(name: str, pattern: object, package: str, known: Mapping[str, Pattern]) -> Pattern:
+def _check_plug_in(name: str, pattern: object, package: str) -> Pattern:
     """Return a pattern whose builder's errors are told, and whose sequence is checked as that of a file."""
     if not isinstance(pattern, Pattern) or pattern.name != name:
         raise TypeError(f"a Pattern of the entry point's name {name} is expected")
-    if name in PATTERNS or name in known:
+    if name in PATTERNS:
         raise ValueError("another pattern has this name")
     TypeAdapter(PatternDescription).validate_python(asdict(_describe_pattern(pattern)))
 
@@ -412,10 +396,10 @@ def find_pattern(name: str) -> Pattern:
     plug_ins = load_plug_ins()
     if name in plug_ins.broken:
         raise InputError("pattern", name, f"one that can be used ({plug_ins.broken[name]})", code="broken_plug_in")
-    if name not in plug_ins.patterns:
-        expected = f"a known pattern, {suggest_nearest(name[:60], [*PATTERNS, *plug_ins.patterns])}"
+    if name not in plug_ins.found:
+        expected = f"a known pattern, {suggest_nearest(name[:60], [*PATTERNS, *plug_ins.found])}"
         raise InputError("pattern", name, expected, code="unknown_pattern")
-    return plug_ins.patterns[name]
+    return plug_ins.found[name]
 
 
 def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
@@ -462,7 +446,7 @@ def _build_by_intensity(pattern: Pattern, where: str, given: object, config: Con
 
 def describe_patterns() -> list[PatternDescription]:
     """Describe every pattern and its parameters, those of other packages last."""
-    return [_describe_pattern(pattern) for pattern in (*_PATTERN_LIST, *load_plug_ins().patterns.values())]
+    return [_describe_pattern(pattern) for pattern in (*_PATTERN_LIST, *load_plug_ins().found.values())]
 
 
 def _describe_pattern(pattern: Pattern) -> PatternDescription:

@@ -1,0 +1,1 @@
+"""Pattern and term of a laboratory for optodrive."""
