@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 from optodrive.core.errors import MISSING, InputError, Unquoted, build_nothing_raised_error
 from optodrive.core.extras import import_extra
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
-from optodrive.core.types.stimuli import FrameSequence
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import Config
+from optodrive.planning.stimuli.ilda import convert_ilda, is_ilda
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture
+from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture, sequence_end_s
 
 HEIGHT_BY_CLASS = {"grid": 1 / 3, "axes": 2 / 3, "curve": 1.0}
 """Share of the full height by class of an element, or of the nearest element around it that has one of these."""
@@ -82,13 +83,26 @@ class _Cost(NamedTuple):
 
 
 def build_drawing(config: Config, where: str, file: bytes, height_m: float, seconds: float) -> FrameSequence:
-    """Build frames that show an SVG drawing for `seconds`, class `curve` at height_m.
+    """Build frames that show an SVG drawing, or each picture of an ILDA file, for `seconds`, class `curve` at height_m.
 
     Raises InputError (bad_picture, too_many, raises_nothing, and without resvg_py missing_extra).
     """
     lattice = Lattice.from_config(config)
-    target_m = height_m * compute_lattice_heights(file, lattice, f"{where}: file")
-    return FrameSequence(frames=tuple(hold_picture(BeamTimeEstimator(config), target_m, seconds, "drawing")))
+    place, estimator = f"{where}: file", BeamTimeEstimator(config)
+    pictures = convert_ilda(file, place) if is_ilda(file) else [file]
+    frames: list[TactileFrame] = []
+    start_s = 0.0
+    for number, picture in enumerate(pictures, start=1):
+        if picture is None:  # a dark one
+            start_s += seconds
+            continue
+        target_m = height_m * compute_lattice_heights(picture, lattice, place)
+        name = "drawing" if len(pictures) == 1 else f"drawing-{number}"
+        frames += hold_picture(estimator, target_m, seconds, name, start_s)
+        start_s = sequence_end_s(FrameSequence(tuple(frames[-1:])))
+    if not frames:
+        raise build_nothing_raised_error(place, "all its points are blanked or black", "a drawing with lines")
+    return FrameSequence(frames=tuple(frames))
 
 
 def compute_lattice_heights(file: bytes, lattice: Lattice, where: str) -> FloatArray:

@@ -272,9 +272,9 @@ _PATTERN_LIST = (
     ),
     Pattern(
         "drawing",
-        "an SVG drawing with lines at three heights, by class: grid, axes, curve",
+        "an SVG drawing with lines at three heights, by class: grid, axes, curve; or an ILDA file",
         (
-            PatternParameter("file", "file", None, "SVG file", required=True),
+            PatternParameter("file", "file", None, "SVG or ILDA file", required=True),
             _height_parameter(90.0, "height of class curve; axes two thirds, grid one third"),
             _SECONDS_PARAMETER,
         ),
