@@ -192,10 +192,10 @@ def heated_plate(seed, power):
     return measure(seed, t, solve(rate, t, [0.0], power)[:, 0], 0.05, power)
 
 
-def draining_tank(seed, flow):
+def draining_tank(seed, flow, start=1.0):
     """Return a tank that drains through an orifice; flow [m] in steps of 1 s."""
     t = 1.0 * np.arange(len(flow))
-    levels = solve(lambda _, y, u: [0.05 * u - 0.09 * np.sqrt(max(y[0], 0.0))], t, [1.0], flow)
+    levels = solve(lambda _, y, u: [0.05 * u - 0.09 * np.sqrt(max(y[0], 0.0))], t, [start], flow)
     return measure(seed, t, levels[:, 0], 2e-3, flow)
 
 
@@ -259,10 +259,10 @@ def coupled_tanks_model(is_start_known=True, is_complete=False):
     )
 
 
-def coupled_tanks(seed, pump, ceiling=np.inf):
+def coupled_tanks(seed, pump, ceiling=np.inf, lower=5.0):
     """Return the lower level of two tanks of which the upper one overflows at 10; pump [m] in steps of 4 s.
 
-    ceiling: level above which the sensor reads no more
+    ceiling: level above which the sensor reads no more; lower: level of the lower one at the start
     """
     t = 4.0 * np.arange(len(pump))
 
@@ -271,7 +271,7 @@ def coupled_tanks(seed, pump, ceiling=np.inf):
         out1 = 0.085 * np.sqrt(upper)
         return [0.065 * u - out1 - 0.3 * max(upper - 10.0, 0.0), out1 - 0.08 * np.sqrt(lower)]
 
-    levels = solve(rate, t, [6.0, 5.0], pump)[:, 1]
+    levels = solve(rate, t, [6.0, lower], pump)[:, 1]
     return measure(seed, t, np.minimum(levels, ceiling), 0.02, pump)
 
 
@@ -329,6 +329,27 @@ def poor_excitation():
             [coupled_tanks(1, pumps)],
             [coupled_tanks(2, _steps(7, 14, 50, 2.0, 5.5))],
         ),
+    }
+
+
+def scaled_records():
+    """Return makers of the records of poor excitation, by name: record(seed, factor of start and inputs)."""
+    sine, ramp = np.sin(3.0 * 0.02 * np.arange(1000)), np.linspace(0.5, 3.0, 700)
+    pumps = np.concatenate([np.full(150, 3.0), np.linspace(3.0, 5.2, 400), np.full(150, 4.6)])
+    step, dry = np.concatenate([np.zeros(10), np.full(290, 120.0)]), {"friction": 0.6}
+    return {
+        "decay, quadratic drag": [lambda seed, f: decay(seed, f, drag=0.8)],
+        "decay, dry friction": [lambda seed, f: decay(seed, f, **dry)],
+        "two decays, dry friction": [
+            lambda seed, f: decay(seed, f, **dry),
+            lambda seed, f: decay(seed + 3, 0.5 * f, **dry),
+        ],
+        "one step, radiation": [lambda seed, f: heated_plate(seed, f * step)],
+        "slow ramp, orifice": [lambda seed, f: draining_tank(seed, f * ramp, f)],
+        "one amplitude, cubic spring": [lambda seed, f: driven(seed, 4.0 * f * sine, cubic=40.0)],
+        "one amplitude, dry friction": [lambda seed, f: driven(seed, 4.0 * f * sine, friction=1.5)],
+        "closed loop, dead zone": [lambda seed, f: servo(seed, f * _steps(seed + 5, 12, 80, -1.5, 1.5))],
+        "slow pump, overflow": [lambda seed, f: coupled_tanks(seed, f * pumps, lower=5.0 * f)],
     }
 
 

@@ -35,7 +35,7 @@ from optodrive.lab.discovery.screening import (
     screen,
 )
 from optodrive.lab.discovery.search import TIGHTNESS, TermSearch
-from optodrive.lab.inference.claim import MAX_NO_EFFECT, NOTHING_SHOWN, Claim, TermClaim, combine_claims
+from optodrive.lab.inference.claim import MAX_NO_EFFECT, NOTHING_SHOWN, Claim, TermClaim, claim_nothing, combine_claims
 from optodrive.lab.inference.noise import estimate_noise
 
 DIFFERENCES, MIN_DIFFERENCES = (4, 8, 12), 32
@@ -115,6 +115,8 @@ class _Discovery:
                 break
             further = self._extend(base, current)
             if further is None:
+                if not found and not self.is_white:  # a pixel's diagnosis says itself what is left
+                    claims.append(claim_nothing(float((current.rmse[:, 1] / self.judge.floor).max())))
                 break
             if (
                 not self._is_enough(base, current, further.proposal, bool(found), is_final=False)

@@ -161,6 +161,9 @@ class Claim:
 NOTHING_SHOWN, NOTHING_SOUGHT = Claim("none"), Claim("incomplete")
 """Claims of a discovery in which no candidate improves anything, and of one with too little data to begin with."""
 
+NEAR_NOISE, FAR_FROM_NOISE = 1.1, 3.0
+"""Errors in units of noise up to which nothing is missing, and above which something is for noise of any form."""
+
 
 @dataclass(frozen=True)
 class TermForm:
@@ -298,6 +301,17 @@ def _list_twins(causes: Causes, evidence: Evidence) -> dict[str, str]:
         if twin not in causes and (other is None or not _list_refusals(other)):
             found[key] = twin
     return found
+
+
+def claim_nothing(error: float) -> Claim:
+    """Return the claim where no candidate improves a simulation.
+
+    error: of free runs of held-out data, in units of the noise, which may be larger than its estimate
+    """
+    if error <= NEAR_NOISE:
+        return NOTHING_SHOWN
+    reason = f"What was held out is predicted with {error:.2g} times the noise, and no term that was tried helps."
+    return Claim("undecided" if error <= FAR_FROM_NOISE else "unexplained", reasons=(reason,))
 
 
 def combine_claims(claims: Sequence[Claim], failures: Mapping[str, str], has_disturbances: bool) -> Claim:

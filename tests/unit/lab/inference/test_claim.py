@@ -27,6 +27,7 @@ from optodrive.lab.inference.claim import (
     TermClaim,
     TermForm,
     claim,
+    claim_nothing,
     combine_claims,
     compute_no_effect,
     format_probability,
@@ -429,3 +430,10 @@ def test_correlated_errors_are_no_evidence_of_an_effect():
     assert compute_no_effect(5.0, 256.0) < MAX_NO_EFFECT
     assert compute_no_effect(3.2, 256.0) < compute_no_effect(3.2, 256.0, tries=100)
     assert weigh_forms([0.0, 0.0, 9.0], [1.0, 0.5, 1.0]) == pytest.approx([2 / 3, 1 / 3, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize(("error", "verdict"), [(1.0, "none"), (2.0, "undecided"), (25.0, "unexplained")])
+def test_a_simulation_far_from_its_data_is_not_said_to_lack_nothing(error, verdict):
+    found = claim_nothing(error)
+    assert found.verdict == verdict
+    assert bool(found.reasons) == (verdict != "none")
