@@ -8,6 +8,7 @@ import { encodeStatus, STATUS_OK } from "./xy2_100.mjs";
 
 const setup = JSON.parse(readFileSync(process.argv[2], "utf8"));
 const emulator = await import(setup.emulator);
+setup.mirrorFault = { name: "", stuck: 0 };
 setup.flash = Uint8Array.from(Buffer.from(setup.image, "hex"));
 
 let seed = setup.seed || 1;
@@ -65,6 +66,7 @@ const commands = {
     if (on) chip.traceLevels(-1);
   },
   inject(name) { chip.inject(name); },
+  mirror(fault) { chip.mirrors.inject(fault); },
   break() { chip.uart.feed([1 << 10]); },
 };
 

@@ -1,6 +1,7 @@
 // One power cycle of an RP2040 with the firmware's image, its circuit and a witness of its pins; with the image's symbols, of
 // what its core does, too.
 
+import { Mirrors } from "./mirrors.mjs";
 import { Uart } from "./uart.mjs";
 import { UsbHost } from "./usb.mjs";
 import { Xy2100 } from "./xy2_100.mjs";
@@ -46,7 +47,8 @@ export class Chip {
       watchdog.timer.enable = false; // its alarm would fire again in the same instant
       onWatchdog();
     };
-    this.xy2 = new Xy2100(rp2040, this.clock, base, head, setup.everyFrame, emit, (pin, high) => this.setPin(pin, high));
+    this.xy2 = new Xy2100(rp2040, this.clock, base, head, setup.everyFrame, (name, ...record) => this.onFrame(emit, name, record), (pin, high) => this.setPin(pin, high));
+    this.mirrors = new Mirrors(rp2040, setup.mirrorFault, random);
     this.bend(rp2040);
     this.gateOpen = this.logged = this.stuck = this.loopStopped = this.tickStopped = false;
     this.level = {};
@@ -141,8 +143,16 @@ export class Chip {
     const [command, high, low] = this.word, value = (high << 8) | low;
     if (this.word.length !== 3) throw new Error(`DAC: ${this.word.length} bytes`);
     if (command === 0x00) this.x = value;
-    else if (command === 0x11) this.emit("mirrors", this.micros, this.x, value);
+    else if (command === 0x11) {
+      this.mirrors.moveTo(this.x, value);
+      this.emit("mirrors", this.micros, this.x, value);
+    }
     else this.emit("dac", this.micros, command, value);
+  }
+
+  onFrame(emit, name, record) {
+    if (name === "mirrors") this.mirrors.moveTo(record[1], record[2]);
+    emit(name, ...record);
   }
 
   // --- the log that the image itself does not write: what the core was told and what its memory says ---

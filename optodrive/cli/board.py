@@ -35,10 +35,11 @@ def _describe(config: "Config", settings: "PicoSettings") -> list[str]:
     from optodrive.link.pico_firmware import list_origins
 
     remark = "" if config.board.uid else ": drawn; state it as uid in [board], so that no other board is accepted"
+    measured = f", measured within {settings.feedback_codes} codes" if settings.feedback_codes else ""
     return [
         f"{'uid':<17}{settings.uid}{remark}",
         f"{'gate':<17}PWM at {settings.gate_hz} Hz",
-        f"{'mirrors':<17}{settings.interface}",
+        f"{'mirrors':<17}{settings.interface}{measured}",
         *(f"{name:<17}{origin}" for name, origin in list_origins(config).items()),
     ]
 

@@ -20,7 +20,7 @@ from optodrive.device.config import Config
 from optodrive.link.board_setup import SIMULATED_CELL_MAX_CODES, build_bench_requirements, permit_retiming
 from optodrive.link.protocol.messages import Limits
 
-CELLS_MAX = 1536
+CELLS_MAX = 1520
 """Spots that a Pico can guard: BOARD_CELLS of its Makefile."""
 PREFERRED_GATE_HZ = 50_000.0
 GATE_MIN_HZ, GATE_MAX_HZ = 30_000.0, 488_000.0
@@ -56,6 +56,7 @@ static const struct board_config SETTINGS = {{
     .window_pulses = BOARD_PULSES,
     .key_edge = true,
     .interface = {interface},
+    .feedback_codes = {feedback_codes},
 }};
 
 #endif
@@ -66,6 +67,7 @@ class PicoSettings(NamedTuple):
     """The settings of a Pico.
 
     uid: 24 hexadecimal digits; gate_hz: PWM frequency of the gate, Hz; interface: to the mirrors, of the configuration
+    feedback_codes: that a measured mirror may be away from its command, 0: the board does not measure it
     """
 
     limits: Limits
@@ -73,6 +75,7 @@ class PicoSettings(NamedTuple):
     gate_hz: int
     baud: int
     interface: str
+    feedback_codes: int
     uid: str
 
     def to_header(self, name: str) -> str:
@@ -109,6 +112,7 @@ def build_pico_settings(config: Config, margin_m: float, uid: str) -> PicoSettin
         gate_hz=_choose_gate_hz(config.laser.pwm_hz),
         baud=config.board.baud,
         interface=config.scanner.interface,
+        feedback_codes=requirements.feedback_codes,
         uid=config.board.uid.lower() or uid,
     )
 

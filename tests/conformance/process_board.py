@@ -15,8 +15,8 @@ READ_WAIT_S = 0.005
 NOT_ITS_OWN = {
     "python": ("B14", "B15", "B16"),
     "independent": ("B16",),
-    "pico-xy2": ("B17",),
-    **dict.fromkeys(("qemu", "pico", "pico-usb"), ("B16", "B17")),
+    "qemu": ("B16", "B17"),
+    **dict.fromkeys(("pico", "pico-usb"), ("B16",)),
 }
 """Guards that a kind of board lacks: the simulated one has no tick, readback or watchdog, and most no scan head."""
 

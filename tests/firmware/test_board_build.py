@@ -91,6 +91,14 @@ def test_the_settings_state_the_interface(config, capsys):
         assert f"    .interface = {stated},\n" in capsys.readouterr().out
 
 
+def test_the_settings_state_half_of_the_largest_cell_of_measured_mirrors(config, capsys):
+    path = config(bandwidth_hz="feedback = true\nbandwidth_hz = 1000.0")
+    assert run(["board", "settings", "--config", str(path)]) == 0
+    codes = build_board_requirements(load_config(str(path))).cell_max_codes // 2
+    assert codes > 500
+    assert f"    .feedback_codes = {codes},\n" in capsys.readouterr().out
+
+
 def test_build_writes_this_image(built, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("SETTINGS")
     out = tmp_path / "board.uf2"

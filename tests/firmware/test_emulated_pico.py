@@ -63,7 +63,7 @@ def test_the_image_as_built_boots_arms_and_emits_what_it_is_sent(shipped):
     reply = host.hello()
     core = board.core
     assert [word[1:] for word in core.dac] == DAC_SETUP
-    assert (bytes(reply.uid), reply.capabilities, reply.cells, reply.window_pulses) == (b"rp2040-00001", 1, 1536, 2048)
+    assert (bytes(reply.uid), reply.capabilities, reply.cells, reply.window_pulses) == (b"rp2040-00001", 1, 1520, 2048)
     assert host.send_checked("ARM_REQ", host_nonce=1) == ["KEY_EDGE"]
     for _ in range(2):
         board.next_step()

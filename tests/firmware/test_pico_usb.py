@@ -192,7 +192,7 @@ def test_doctor_finds_the_shipped_image_in_order(image):
     clock.sleep(BOOT_US * 1e-6)
     findings = {finding.check: finding for finding in check_bare_board(MemoryLink(pico, clock), clock)}
     assert {finding.status for finding in findings.values()} == {"ok"}
-    assert findings["capacities"].observation == "2048 points, 2048 pulses a second, 1536 cells of 1300 codes"
+    assert findings["capacities"].observation == "2048 points, 2048 pulses a second, 1520 cells of 1300 codes"
     assert {entry["state"] for entry in log if entry["event"] == "state"} == {"DISARMED"}
     assert pico.pins == []
     pico.close()

@@ -21,13 +21,14 @@ from pathlib import Path
 from firmware_ports import require
 from optodrive.link.protocol import messages as m
 from optodrive.link.simulator.guards import INTERFACES, BoardSettings
+from optodrive.link.simulator.measured_mirrors import MIRROR_FAULTS
 
 HERE = Path(__file__).parent
 PORT = HERE.parents[1] / "firmware_protocol" / "ports" / "rp2040"
 CORE, EMULATION = PORT.parents[1] / "core", PORT.parents[1] / "emulator"
 MODULES = Path(sys.prefix).parent / ".node"
 EMULATOR = MODULES / "node_modules" / "rp2040js" / "dist" / "esm" / "index.js"
-SETTINGS = struct.Struct("<3H2x3I8H12sI4H?B2x")
+SETTINGS = struct.Struct("<3H2x3I8H12sI4H?BH")
 """struct board_config of the port."""
 FIRMWARE = 0x0001_0000
 BLOCK = struct.Struct("<8I476sI")
@@ -120,7 +121,8 @@ class PicoImage:
         limits = vars(settings.limits).values()
         uid = bytes.fromhex(settings.uid)
         sizes = settings.cell_codes, settings.queue_points, settings.cells, settings.window_pulses
-        packed = SETTINGS.pack(*limits, uid, FIRMWARE, *sizes, settings.key_edge, INTERFACES.index(settings.interface))
+        mirrors = INTERFACES.index(settings.interface), settings.feedback_codes
+        packed = SETTINGS.pack(*limits, uid, FIRMWARE, *sizes, settings.key_edge, *mirrors)
         return self.flash[:at] + packed + self.flash[at + len(packed) :]
 
 
@@ -128,7 +130,7 @@ class EmulatedPico:
     """A Pico with its circuit. settings: None for those of the image. sink: receives each log event."""
 
     lease_until_us = 0
-    FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate", *ANSWERS)
+    FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate", *ANSWERS, *MIRROR_FAULTS)
 
     def __init__(self, image, settings, sink, seed=None):
         self._sink, self._now_us, self.chip_us = sink, 0, 0.0
@@ -224,9 +226,12 @@ class EmulatedPico:
         return
 
     def inject_fault(self, name):
-        """Break a part of the board, or its scan head, or repair that: one of FAULTS."""
+        """Break a part of the board, its scan head or a mirror, or repair that: one of FAULTS."""
         if name in ANSWERS:
             self.answer(**ANSWERS[name])
+        if name in MIRROR_FAULTS or name == "repair":
+            self._command("mirror", name)
+        if name in (*ANSWERS, *MIRROR_FAULTS):
             return
         self._command("inject", name)
 

@@ -3,6 +3,7 @@
 
 #include "board.h"
 #include "chip.h"
+#include "feedback.h"
 #include "host_port.h"
 #include "outputs.h"
 #include "pins.h"
@@ -10,6 +11,7 @@
 #include "xy2_100.h"
 
 #define LOOP_BYTES_MAX 64u
+#define TEMPERATURE_UNKNOWN_DC 250 /* the ADC measures the mirrors */
 
 static struct board board;
 static const struct board_config *const volatile settings = &SETTINGS; /* read from memory: an image's may be replaced */
@@ -38,6 +40,10 @@ static bool read_head(void *context, uint16_t *status) {
     (void)context;
     return xy2_100_read_status(status);
 }
+static void read_position(void *context, int32_t *x, int32_t *y) {
+    (void)context;
+    feedback_read(x, y);
+}
 static uint32_t read_triggers(void *context, uint64_t *last_us) {
     (void)context;
     return chip_read_triggers(last_us);
@@ -56,7 +62,7 @@ static uint32_t read_entropy(void *context) {
 }
 static int16_t read_temperature_dc(void *context) {
     (void)context;
-    return chip_temperature_dc();
+    return settings->feedback_codes ? TEMPERATURE_UNKNOWN_DC : chip_temperature_dc();
 }
 static void send(void *context, const uint8_t *frame, size_t n) {
     (void)context;
@@ -86,6 +92,7 @@ static const struct board_hal HAL = {
     .move_mirrors = move_mirrors,
     .read_inputs = read_inputs,
     .read_head = read_head,
+    .read_position = read_position,
     .read_triggers = read_triggers,
     .set_indicator = set_indicator,
     .set_relay = set_relay,
@@ -133,6 +140,9 @@ int main(void) {
     enum reset_cause cause = chip_reset_cause();
     chip_start(on_alarm);
     outputs_start(settings->interface);
+    if (settings->feedback_codes) {
+        feedback_start();
+    }
     chip_start_trigger(PIN_TRIGGER);
     host_start(settings->uid);
     last_tick_us = chip_now_us();

@@ -23,6 +23,8 @@
 #define PIN_XY2_Y 19u
 #define PIN_XY2_STATUS 21u
 #define PIN_TRIGGER 20u    /* a rising edge starts the job that awaits it */
+#define PIN_FEEDBACK_X 26u /* input 0 of the ADC, measured position of the mirrors; the two follow each other */
+#define PIN_FEEDBACK_Y 27u
 #define PIN_TICK 22u       /* high while the tick runs, for an oscilloscope */
 
 #endif

@@ -56,6 +56,7 @@
 #define PAD_PULL_UP BIT(3)
 #define PAD_4_MA (1u << 4)
 #define PAD_INPUT BIT(6)
+#define PAD_OUTPUT_OFF BIT(7)
 #define PAD_AFTER_RESET (PAD_SCHMITT | PAD_PULL_DOWN | PAD_4_MA | PAD_INPUT) /* the RP2350 also isolates it */
 
 /* --- UART 0 (Arm PL011), SPI 0 (Arm PL022) --- */
@@ -133,6 +134,9 @@
 #define TIMER_INTF (TIMER_INTERRUPTS + 0x8u)
 #define ADC_CS ADC
 #define ADC_RESULT (ADC + 0x4u)
+#define ADC_FCS (ADC + 0x8u)
+#define ADC_FIFO (ADC + 0xcu)
+#define ADC_DIV (ADC + 0x10u)
 
 /* --- the processor --- */
 #define SYSTICK_CTRL 0xe000e010u

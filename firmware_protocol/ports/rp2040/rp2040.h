@@ -65,6 +65,7 @@
 #define DMA_WRITE_RING(bits) (BIT(10) | (bits) << 6)
 #define DMA_CHAIN(channel) ((uint32_t)(channel) << 11)
 #define DMA_REQUEST(source) ((source) << 15)
+#define DMA_ADC 36u
 
 /* --- interrupts --- */
 #define IO_IRQ 13u

@@ -57,6 +57,7 @@
 #define DMA_WRITE_RING(bits) (BIT(12) | (bits) << 8)
 #define DMA_CHAIN(channel) ((uint32_t)(channel) << 13)
 #define DMA_REQUEST(source) ((source) << 17)
+#define DMA_ADC 48u
 
 /* --- interrupts --- */
 #define IO_IRQ 21u

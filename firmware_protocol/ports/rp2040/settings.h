@@ -37,6 +37,7 @@ static const struct board_config SETTINGS = {
     .window_pulses = BOARD_PULSES,
     .key_edge = true,
     .interface = INTERFACE_ANALOG,
+    .feedback_codes = 0,
 };
 
 #endif
