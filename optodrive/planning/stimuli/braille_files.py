@@ -45,29 +45,40 @@ def build_braille_file(
     seconds: float,
     format: FileFormat = "auto",
     table: str | None = None,
+    start_page: int = 1,
+    pages: int | None = None,
 ) -> FrameSequence:
     """Build the pages of a BRF or PEF file, or of text, wrapped at words into the display's lines, each for `seconds`.
 
-    format: what the file holds; table: of liblouis, for text. Raises InputError (bad_text, does_not_fit, too_many,
-    raises_nothing, and with a table bad_table, missing_library).
+    format: what the file holds; table: of liblouis, for text; start_page: first page of the file, from 1, that is
+    shown; pages: how many of them, None for all from there. Raises InputError (bad_text, does_not_fit, too_many,
+    raises_nothing, bad_parameter, and with a table bad_table, missing_library).
     """
     place = f"{where}: file"
     if len(file) > 4 * CHARACTERS_MAX:
         raise InputError(place, Unquoted(f"{len(file)} bytes"), f"at most {4 * CHARACTERS_MAX}", code="too_many")
     if format != "text" and _is_markup(file):
-        pages = [[_split_words(row) for row in page] for page in _read_pef(file, place)]
+        found = [[_split_words(row) for row in page] for page in _read_pef(file, place)]
     else:
         text = _decode(file, place).replace("\r\n", "\n").replace("\r", "\n").rstrip(CPM_END)
         if len(text) > CHARACTERS_MAX or text.count("\f") >= PAGES_MAX:
-            found = Unquoted(f"{len(text)} characters, {text.count(chr(12)) + 1} pages")
-            raise InputError(place, found, f"at most {CHARACTERS_MAX} characters, {PAGES_MAX} pages", code="too_many")
+            size = Unquoted(f"{len(text)} characters, {text.count(chr(12)) + 1} pages")
+            raise InputError(place, size, f"at most {CHARACTERS_MAX} characters, {PAGES_MAX} pages", code="too_many")
         if format == "text" or (format == "auto" and _is_text(text)):
-            pages = [translate(page, table, place) for page in text.split("\f")]
+            found = [translate(page, table, place) for page in text.split("\f")]
         else:
-            pages = [[_split_words(row) for row in page] for page in _read_brf(text, place)]
-    shown = [page for page in map(_strip_rows, pages) if page]
+            found = [[_split_words(row) for row in page] for page in _read_brf(text, place)]
+    if start_page > max(1, len(found)):
+        expected = f"a page of the file, 1 to {len(found)}"
+        raise InputError(f"{where}: start_page", start_page, expected, code="bad_parameter")
+    chosen = found[start_page - 1 :][:pages]
+    shown = [page for page in map(_strip_rows, chosen) if page]
     if not shown:
-        raise build_nothing_raised_error(place, "all its pages are blank", "braille with at least one raised dot")
+        raise build_nothing_raised_error(
+            place,
+            "all its pages are blank" if len(chosen) == len(found) else "the chosen pages are blank",
+            "braille with at least one raised dot",
+        )
     return show_pages(config, where, shown, height_m, seconds, SPACING)
 
 

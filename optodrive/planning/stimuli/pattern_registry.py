@@ -26,7 +26,7 @@ from optodrive.planning.stimuli.sequence_file import (
     validate_sequence,
 )
 from optodrive.planning.stimuli.shapes import build_showcase
-from optodrive.planning.stimuli.text import build_text
+from optodrive.planning.stimuli.text import PAGES_MAX, build_text
 
 _CENTRE_PARAMETER = PatternParameter(
     "centre", "pixel", None, "pixel at the centre of the stimulus; the display's middle by default"
@@ -290,6 +290,10 @@ _PATTERN_LIST = (
             PatternParameter("seconds", "number", 2.0, "minimum time per page", "s", min=0.0, max=600.0),
             _choice_parameter("format", "auto", "what the file holds", ("auto", "braille", "text")),
             PatternParameter("table", "text", None, "table of liblouis, for text"),
+            _integer_parameter("start_page", 1, "first page of the file that is shown", 1, PAGES_MAX),
+            PatternParameter(
+                "pages", "integer", None, "number of them; all from there by default", min=1, max=PAGES_MAX
+            ),
         ),
         build_braille_file,
     ),

@@ -162,3 +162,31 @@ def test_another_file_is_refused_in_one_line(file, message):
 def test_a_display_without_room_is_one_line():
     with pytest.raises(InputError, match="expected a display with 3 × 2 pixels for a cell"):
         show(b"ABC", "display-1")
+
+
+THREE = {
+    "braille": b"A\fB\fC",
+    "text": b"a\fb\fc",
+    "auto": PEF.format("".join(f"<page><row>{each}</row></page>" for each in "⠁⠃⠉")).encode(),
+}
+
+
+@pytest.mark.parametrize("kind", THREE)
+@pytest.mark.parametrize(
+    ("given", "cells"), [({}, "⠁⠃⠉"), ({"start_page": 2}, "⠃⠉"), ({"start_page": "2", "pages": "1"}, "⠃")]
+)
+def test_a_reader_begins_at_a_page_of_the_file(kind, given, cells):
+    sequence = build_pattern(
+        "braille-file", {"file": THREE[kind], "format": kind, **given}, load_config("display-1511")
+    )
+    assert read_cells(sequence) == cells
+
+
+def test_a_page_that_the_file_has_not_or_that_is_blank_is_refused_in_one_line():
+    def build(file, page):
+        build_pattern("braille-file", {"file": file, "start_page": page, "pages": 1}, load_config("display-1511"))
+
+    with pytest.raises(InputError, match=r"start_page: got 4, expected a page of the file, 1 to 3$"):
+        build(THREE["braille"], 4)
+    with pytest.raises(InputError, match="the chosen pages are blank"):
+        build(b"A\f\fC", 2)
