@@ -76,7 +76,7 @@ def info(config: ConfigOption = None, json: JsonOption = False) -> None:
     display, clock = DisplayModel.from_config(load_run_config(config, None)), MonotonicClock()
     board = display.config.board
     with build_dac(board, clock) as dac:
-        _, heat = read_heat(dac.transport, dac.find_identity(), display, clock)
+        _, heat = read_heat(dac.transport, dac.find_uid(), display, clock)
         document = {
             "device": dac.format.label,
             "name": dac.name,
@@ -122,27 +122,27 @@ def play(
     dac.require_interlock()
     sequence = load_sequence(frames, display.config)
     announce_compilation()
-    with _defer_signals() as raise_if_signalled, dac:
-        identity = dac.find_identity()
-        with HeatRecord(dac.transport, identity, display, clock, raise_if_signalled) as record:
-            budget = _recall_budget(record, clock)
-            with show_progress("planning") as on_progress:
-                planned_sequence, feasibility = check_feasibility(
-                    display,
-                    sequence,
-                    display.build_cold_heat(),
-                    budget,
-                    _combine_progress(raise_if_signalled, on_progress),
-                    **options,
-                )
-            verified = encode_verified(
-                planned_sequence.plan, PointScale.from_config(display.config), budget, display.budget
+    with (
+        _defer_signals() as raise_if_signalled,
+        dac,
+        HeatRecord(dac.transport, dac.find_uid(), display, clock, raise_if_signalled) as record,
+    ):
+        budget = _recall_budget(record, clock)
+        with show_progress("planning") as on_progress:
+            planned_sequence, feasibility = check_feasibility(
+                display,
+                sequence,
+                display.build_cold_heat(),
+                budget,
+                _combine_progress(raise_if_signalled, on_progress),
+                **options,
             )
-            with show_progress("playing") as on_progress:
-                on_progress = _combine_progress(raise_if_signalled, on_progress)
-                playback = _play_and_record(
-                    dac, record, budget, display, planned_sequence, verified, clock, on_progress
-                )
+        verified = encode_verified(
+            planned_sequence.plan, PointScale.from_config(display.config), budget, display.budget
+        )
+        with show_progress("playing") as on_progress:
+            on_progress = _combine_progress(raise_if_signalled, on_progress)
+            playback = _play_and_record(dac, record, budget, display, planned_sequence, verified, clock, on_progress)
     summary = summarize_plan(planned_sequence, feasibility)
     playback_summary = _summarize_playback(dac, display, planned_sequence, verified, playback)
     document = {**summary.model_dump(mode="json"), "dac": playback_summary}

@@ -23,7 +23,7 @@ def check_dac(config: Config, clock: Clock) -> list[Finding]:
     dac = build_dac(config.board, clock)
     try:
         with dac:
-            identity = dac.find_identity()
+            identity = dac.find_uid()
             findings = [_check_identity(dac, config), _check_readiness(dac)]
         findings.append(check_heat(dac.transport, identity, config, clock))
     except InputError as error:

@@ -121,6 +121,9 @@ class Config(Section):
                 place = f"stages[{number}].{error.place}" if self.stages else error.place
                 raise ConflictError(place, error.value, error.expected) from None
         for number, stage in enumerate(self.stages):
+            if len(self.stages) > 1 and stage.board.is_dac:
+                place, expected = f"stages[{number}].board.transport", "a board's: laser DACs have no common clock"
+                raise ConflictError(place, stage.board.transport, expected)
             for key, ours in (("name", stage.name), ("board", stage.board.address)):
                 for other, earlier in enumerate(self.stages[:number]):
                     # Two stages on one port: the second would open it while the first has the lease.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from optodrive.core.errors import InputError
 from optodrive.core.laser_power import find_proportion_excess, find_proportional_power_w
 from optodrive.core.types.arrays import IntArray
 from optodrive.device.config import Config
@@ -34,11 +35,14 @@ MIRROR_RANGE = ("x_min", "x_max", "y_min", "y_max")
 def build_port_settings(config: Config) -> PortSettings:
     """Return the address of the board of a configuration with one stage.
 
-    A simulated board is built for the display: its own limits are those that the display requires, and no pixel shares
-    a cell of its spot guards with another. Its range of the mirrors is that of the scanner.
+    A board in software is built for the display: its own limits are those that the display requires, and no pixel
+    shares a cell of its spot guards with another. Its range of the mirrors is that of the scanner. Raise InputError for
+    trajectories that no board has.
     """
     board, own_settings = config.board, dict[str, int | str]()
-    if board.transport == "simulated":
+    if config.scanner.trajectories == "early_steps":
+        raise InputError("scanner.trajectories", "early_steps", "'steps': only `optodrive dac play` sends steps early")
+    if board.transport == "simulated" or board.is_dac:
         requirements = build_board_requirements(config)
         limits = permit_retiming(requirements.limits)
         own_settings = {name: value for name, value in asdict(limits).items() if name not in MIRROR_RANGE}
@@ -47,7 +51,9 @@ def build_port_settings(config: Config) -> PortSettings:
         own_settings["feedback_codes"] = requirements.feedback_codes
         own_settings["cells"] = max(SIMULATED_CELLS, requirements.pixels)
     address = {field.name: getattr(board, field.name) for field in fields(PortSettings) if hasattr(board, field.name)}
-    return PortSettings(**address, own_settings=own_settings)
+    if not board.is_dac:
+        address["interlock_watched"] = None
+    return PortSettings(**address, own_settings=own_settings, curve=config.laser.curve)
 
 
 def permit_retiming(limits: m.Limits) -> m.Limits:
@@ -87,7 +93,7 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
         scale=scale,
         lease_s=config.board.lease_s,
         baud=config.board.baud,
-        uid=config.board.uid,
+        uid="" if config.board.is_dac else config.board.uid,  # a DAC's driver compares it
         interface=config.scanner.interface,
         feedback=config.scanner.feedback,
         values=ConfiguredValues(

@@ -47,6 +47,7 @@ from optodrive.core.errors import InputError, refuse_os_error
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState
+from optodrive.device.config import Config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import build_cold_budget_state, shift_state
@@ -67,6 +68,8 @@ BOARDS = "board"
 """Kind of a display that boards draw. Its identity is that of `join_uids`."""
 LIGHTLESS = frozenset(name.encode("ascii").hex() for name in ("simulated001", "host board 1"))
 """Uids of boards that are programs: they heat nothing, so that each of their starts is cold."""
+UNKNOWN_UID = "0" * 24
+"""Uid of the board of a laser DAC that does not say which one it is."""
 PART = "part"
 
 
@@ -92,6 +95,14 @@ def join_uids(uids: Iterable[str], is_part: bool = False) -> str:
     """
     joined = "-".join(sorted(set(uids)))
     return "" if LIGHTLESS.issuperset(uids) else f"{joined}-{PART}" if is_part else joined
+
+
+def identify_display(config: Config, uids: Iterable[str], is_part: bool = False) -> tuple[str, str | None]:
+    """Return kind and identity of a display for `HeatRecord`, by the uids of its boards or that of its laser DAC."""
+    identity = join_uids(uids, is_part)
+    if not config.board.is_dac:
+        return BOARDS, identity
+    return config.board.transport, None if identity == UNKNOWN_UID else identity
 
 
 class HeatRecord:

@@ -11,6 +11,7 @@ from optodrive.device.config import Config
 from optodrive.device.config_file import load_config
 from optodrive.link.dac.devices.helios import Helios
 from optodrive.link.dac.encoding import PointScale, decode, encode
+from optodrive.link.dac.laser_dac import build_uid
 from optodrive.link.dac.player import VerifiedChunks, encode_verified
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.heat_record import HeatRecord
@@ -72,5 +73,5 @@ class Bench:
 
 def record_cold(display, kind, identity):
     """Record that a device's display is cold, as after a play long ago."""
-    with HeatRecord(kind, identity, display, ManualClock()) as record:
+    with HeatRecord(kind, build_uid(identity), display, ManualClock()) as record:
         record.save(display.build_cold_state()[1])

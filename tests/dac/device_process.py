@@ -17,6 +17,7 @@ import numpy as np
 
 from dac.emulated_ether_dream import CLOCK_HZ, Connection, EtherDreamCore
 from dac.emulated_idn import IdnCore
+from optodrive.core.processes import LIGHT, set_realtime_priority
 
 ETHER_DREAM_PORT, IDN_PORT = 7765, 7255
 REST_S = 2.0
@@ -45,6 +46,7 @@ class DeviceProcess:
         if not self.pid:
             os.close(ready)
             _end_with_parent()
+            set_realtime_priority(LIGHT)  # a device is no process that waits for others
             try:
                 stopped = []
                 signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))

@@ -3,6 +3,7 @@
 import json
 import resource
 import signal
+from pathlib import Path
 
 import pytest
 import usb.backend.libusb1
@@ -191,6 +192,14 @@ def test_a_missing_helios_is_one_line(desk, capsys):
     assert capsys.readouterr().err == ("optodrive: board: got '1209:e500', expected a connected USB device\n")
 
 
-def test_a_daemon_on_a_helios_is_rejected(desk, capsys):
-    assert run(["serve", *desk.config()]) == 2
-    assert "the daemon cannot use a laser DAC, see `optodrive dac play`" in capsys.readouterr().err
+def test_a_daemon_on_a_dac_without_an_interlock_is_refused(desk, capsys):
+    assert run(["serve", *desk.config("false")]) == 2
+    assert "interlock_watched: got false, expected true once an external interlock" in capsys.readouterr().err.lower()
+
+
+def test_a_daemon_with_early_steps_is_refused(desk, capsys):
+    path = desk.config()[1]
+    text = Path(path).read_text().replace("[scanner]", '[scanner]\ntrajectories = "early_steps"')
+    Path(path).write_text(text)
+    assert run(["serve", "--config", path]) == 2
+    assert "only `optodrive dac play` sends steps early" in capsys.readouterr().err

@@ -29,13 +29,14 @@ from optodrive.device.config_file import locate_shipped
 from optodrive.link.dac.devices.ether_dream import EtherDream
 from optodrive.link.dac.devices.helios import Helios
 from optodrive.link.dac.formats.ether_dream import BROADCAST_PORT
+from optodrive.link.dac.laser_dac import build_uid
 from optodrive.planning import heat_record
 from optodrive.planning.stimuli.sequence_file import sequence_to_json
 from reference_models.shipped_display import build_model, build_worst_factors
 from reference_models.thermal_display import TOUCHED, build_true_display
 
 USERS = (0, 1001, 1002)
-RECORD = "helios-any"
+RECORD = f"helios-{build_uid('any')}"
 LONG = build_train(width_s=0.04, gap_s=0.002, power_w=2.45, duration_s=4.0)
 AFTER_DEATH_S, BETWEEN_S = 1.0, 0.3
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="processes of several users need root")
@@ -354,7 +355,7 @@ def test_every_spelling_of_an_address_is_one_display(desk, monkeypatch):
         monkeypatch.setenv("HOME", str(desk.folder / str(number)))
         monkeypatch.setenv("XDG_STATE_HOME", "relative")
         assert desk.is_recorded(spelling)
-    assert [path.name for path in heat_record.FOLDER.iterdir()] == [f"ether_dream-{MAC.replace(':', '-')}"]
+    assert [path.name for path in heat_record.FOLDER.iterdir()] == [f"ether_dream-{build_uid(MAC)}"]
 
 
 def test_records_of_spellings_are_caught(desk, monkeypatch):

@@ -28,7 +28,7 @@ from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import LEASED_STATES
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.heat_record import BOARDS, HeatRecord, join_uids, read_boot
+from optodrive.planning.heat_record import HeatRecord, identify_display, join_uids, read_boot
 from optodrive.planning.limiter.limiter import shift_state
 
 RETRY_S = 1.0
@@ -134,7 +134,8 @@ class KeptHeat:
 
     def _recall(self, identity: str, is_replaced: bool, continues: bool) -> Recalled:
         """Open a record, in the executor's thread. is_replaced: whether other boards drew the display before."""
-        record = HeatRecord(BOARDS, identity, self._display, self._clock, owner=self._owner).open()
+        named = identify_display(self._display.config, identity.split("-"))
+        record = HeatRecord(*named, self._display, self._clock, owner=self._owner).open()
         if is_replaced and not record.hot_reason:
             record.hot_reason = "its board was replaced"
         if continues and record.resume():

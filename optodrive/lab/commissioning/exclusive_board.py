@@ -38,7 +38,7 @@ from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.heat_record import BOARDS, HeatRecord, join_uids
+from optodrive.planning.heat_record import HeatRecord, identify_display
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import limit, shift_state, verify
 
@@ -288,8 +288,8 @@ class ExclusiveBoard(ArmedBoard):
         def keep_link() -> None:
             self.session.step(LOOP_STEP_S, renew_lease=False)
 
-        identity = join_uids([self.session.board.uid], self._is_part)
-        record = HeatRecord(BOARDS, identity, self.display, self._clock, keep_link).open()
+        kind, identity = identify_display(self.config, [self.session.board.uid], self._is_part)
+        record = HeatRecord(kind, identity, self.display, self._clock, keep_link).open()
         self._state, self._record = record.load(), record
         self._timeline_zero_s = self.session.board_s()
         if record.read_cooling()[1]:

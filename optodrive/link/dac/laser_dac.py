@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from contextlib import suppress
+from hashlib import sha256
 from ipaddress import AddressValueError, IPv6Address
 from types import TracebackType
 from typing import Any, ClassVar, Self
@@ -11,6 +12,13 @@ from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config_sections import BoardSection
 from optodrive.link.dac.formats.base import Chunk
 from optodrive.link.dac.formats.registry import find_format
+
+UID_DIGITS = 24
+
+
+def build_uid(identity: str) -> str:
+    """Return what a DAC says it is as a board's uid."""
+    return sha256(identity.encode()).hexdigest()[:UID_DIGITS]
 
 
 class LaserDac(ABC):
@@ -59,6 +67,11 @@ class LaserDac(ABC):
     def find_identity(self) -> str | None:
         """Return the identity of the open DAC. Wait for it where it comes by itself."""
         return self.identity
+
+    def find_uid(self) -> str | None:
+        """Return the identity of the open DAC as a board's uid, 24 hexadecimal digits, None if it does not say."""
+        identity = self.find_identity()
+        return build_uid(identity) if identity else None
 
     def close(self) -> None:
         """Stop and release the DAC. Raise LinkError if it may not have received the stop. Do nothing if closed."""

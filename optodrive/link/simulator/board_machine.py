@@ -104,6 +104,11 @@ class BoardMachine:
         """Ticks since power-up."""
         return self.now_us - self.epoch_us
 
+    @property
+    def duty(self) -> int:
+        """Duty of the present light, 0 with the gate off."""
+        return self._current_point.duty if self.gate and self._current_point is not None else 0
+
     # --- time ---------------------------------------------------------------------------------------------------
 
     def next_event_us(self) -> int | None:
@@ -320,6 +325,10 @@ class BoardMachine:
     @property
     def _is_safe(self) -> bool:
         return self.inputs == SAFE_INPUTS and self._follows
+
+    def fail(self, fault: str) -> None:
+        """Enter FAULT by a cause that lies behind the outputs."""
+        self._enter_fault(fault)
 
     def set_input(self, name: str, value: bool) -> None:
         """Change an input: interlock (True: closed), key (True: on), estop (True: pressed)."""

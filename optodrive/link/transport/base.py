@@ -20,7 +20,9 @@ class PortSettings:
 
     transport: name of a transport; port: serial device; baud: its bit rate, 1/s
     vendor_id, product_id, serial_number: of a USB device; an empty serial number accepts the only device of its kind
-    own_settings: the settings that a simulated board has by itself, by their name in its file of limits
+    own_settings: the settings that a board in software has by itself, by their name in its file of limits
+    uid, points_per_s, curve: of a laser DAC: its name, its rate, and its laser's power by duty, W
+    interlock_watched: whether an external interlock is stated for it; None for a board, which has one of its own
     """
 
     transport: str
@@ -30,6 +32,10 @@ class PortSettings:
     product_id: int | None = None
     serial_number: str = ""
     own_settings: dict[str, int | str] = field(default_factory=dict)
+    uid: str = ""
+    points_per_s: int = 40_000
+    curve: tuple[tuple[float, float], ...] = ()
+    interlock_watched: bool | None = None
 
 
 ERROR_TEXT_MAX = 200

@@ -12,18 +12,25 @@ from optodrive.link.transport.simulated import SimulatedBoard
 
 
 def iterate_transports() -> Iterator[TransportKind]:
-    """Yield the TRANSPORT of every module in this package that has one. A module is imported when its turn comes."""
+    """Yield TRANSPORT or TRANSPORTS of every module in this package. A module is imported when its turn comes."""
     for item in iter_modules(transport.__path__):
         module = import_module(f"{transport.__name__}.{item.name}")
         if hasattr(module, "TRANSPORT"):
             yield module.TRANSPORT
+        yield from getattr(module, "TRANSPORTS", ())
 
 
 def find_transport_factory(port: PortSettings) -> Callable[[], Transport]:
     """Return a factory for the configured transport, which it does not open.
 
-    Raise InputError for a laser DAC, which does not use the board's protocol.
+    Raise InputError for a laser DAC without a statement of an external interlock.
     """
+    if port.interlock_watched is False:
+        raise InputError(
+            "board.interlock_watched",
+            False,
+            f"true once an external interlock cuts the laser: transport {port.transport!r} has none, and emits nothing",
+        )
     names = []
     for kind in iterate_transports():  # the search ends before the libraries of other transports are imported
         if kind.name == port.transport:
@@ -32,7 +39,7 @@ def find_transport_factory(port: PortSettings) -> Callable[[], Transport]:
     raise InputError(
         "board.transport",
         port.transport,
-        f"one of {', '.join(sorted(names))}: the daemon cannot use a laser DAC, see `optodrive dac play`",
+        f"one of {', '.join(sorted(names))}",
     )
 
 

@@ -20,6 +20,8 @@ from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.arrays import IntArray
 
 CHUNK_MAX_S = 0.025
+CLOCK_ERROR = 2e-4
+"""Largest relative difference of two crystals."""
 
 PointTable = IntArray
 """Points [n, 3]: code of mirror x, code of mirror y, level. Codes have 12 bits."""
@@ -69,6 +71,11 @@ class DacFormat(ABC):
     @abstractmethod
     def point_ticks(self) -> int:
         """Duration of a point in clock ticks."""
+
+    @property
+    def slowest_point_s(self) -> float:
+        """Longest duration of a point by this computer's clock, of a device that keeps the rate, s."""
+        return self.point_ticks / self.clock_hz * (1.0 + CLOCK_ERROR)
 
     @property
     def stretch(self) -> float:

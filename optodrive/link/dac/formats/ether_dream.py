@@ -72,6 +72,11 @@ class EtherDreamFormat(DacFormat):
         return self.clock_hz // self.points_per_s
 
     @property
+    def slowest_point_s(self) -> float:
+        """Duration with the tick that some count more."""
+        return super().slowest_point_s * self.stretch
+
+    @property
     def stretch(self) -> float:
         """One tick more: sources differ in whether the counter includes its last value."""
         return 1.0 + 1.0 / self.point_ticks

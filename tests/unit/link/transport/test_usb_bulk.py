@@ -10,7 +10,7 @@ from usb_bridge import UsbBridge
 from displays import DISPLAYS
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError
-from optodrive.device.config_sections import DAC_POWER_STEPS, BoardSection
+from optodrive.device.config_sections import BoardSection
 from optodrive.link.board_setup import build_board_requirements, build_port_settings
 from optodrive.link.protocol.quantisation import quantise
 from optodrive.link.session.session import BoardSession
@@ -163,6 +163,9 @@ def test_the_registry_builds_the_configured_transport():
     assert usb_board().name == "usb 1209:0001 A1"
     assert find_factory(transport="serial", port="/dev/ttyX")().name == "/dev/ttyX"
     stated = get_args(BoardSection.model_fields["transport"].annotation)
-    assert {*(kind.name for kind in iterate_transports()), *DAC_POWER_STEPS} == set(stated)
-    with pytest.raises(InputError, match="the daemon cannot use a laser DAC"):
+    assert {kind.name for kind in iterate_transports()} == set(stated)
+    dac_board = find_factory(transport="idn", port="dac", interlock_watched=True)()
+    assert dac_board.name == "idn dac"
+    dac_board.release()
+    with pytest.raises(InputError, match="true once an external interlock cuts the laser"):
         find_factory(transport="helios")
