@@ -41,7 +41,12 @@ def new(
         typer.Option("--lens-mm", metavar="MM", help="Focal length of the f-theta lens."),
     ] = None,
     port: Annotated[
-        str | None, typer.Option("--port", metavar="DEVICE", help="Serial device of the board, or: simulated.")
+        str | None,
+        typer.Option(
+            "--port",
+            metavar="DEVICE",
+            help="Serial device of the board, simulated, helios, ether_dream:HOST or idn:HOST.",
+        ),
     ] = None,
     kpps: Annotated[
         float | None,
@@ -63,7 +68,7 @@ def new(
     farthest_m = 0.5e-3 * (max(rows, columns) - 1) * pitch_mm
     question = "Focal length of the f-theta lens, mm"
     lens_mm = _ask("--lens-mm", lens_mm, question, 220.0, lambda option, mm: check_lens(option, mm, farthest_m))
-    port = _ask("--port", port, "Serial device of the board, or: simulated", "simulated", check_port)
+    port = _ask("--port", port, "Serial device of the board, simulated, or a laser DAC", "simulated", check_port)
     display = NewDisplay(file.stem, rows, columns, 1e-3 * pitch_mm, power_w, 1e-3 * lens_mm, port, kpps)
     text, config = write_template(display, file)
     DisplayModel.from_config(config)

@@ -9,6 +9,7 @@ from optodrive.core.plausibility import PlausibleRange, collect_ranges, describe
 from optodrive.core.toml_model import parse_toml
 from optodrive.device.config import Config
 from optodrive.device.config_file import build_config, load_config, locate_shipped
+from optodrive.device.config_sections import DAC_HALF_RANGE_CODES, DAC_POWER_STEPS, NETWORK_DACS
 
 TEMPLATE = "display-16"
 SIMULATED = "simulated"
@@ -30,8 +31,8 @@ HEAD_LINES = 2
 class NewDisplay:
     """Values that tell a new display from the template, in SI units.
 
-    port: a serial device, or `simulated`; kpps: rating of the galvos at 8°, thousands of points per second, None if
-    the template's servo stays
+    port: a serial device, `simulated`, or a laser DAC as `split_port` reads it
+    kpps: rating of the galvos at 8°, thousands of points per second, None if the template's servo stays
     """
 
     name: str
@@ -63,12 +64,34 @@ def write_template(display: NewDisplay, path: Path) -> tuple[str, Config]:
             section = line.strip("[]")
         key = line.partition(" ")[0]
         written.append(values.pop((section, key), line))
-        if (section, key) == ("board", "transport") and display.port != SIMULATED:
-            written.append(f"port = {json.dumps(display.port)}")
+        if (section, key) == ("board", "transport"):
+            written += _list_address(*split_port(display.port))
+        if (section, key) == ("scanner", "slew_rad_per_s") and split_port(display.port)[0] in DAC_POWER_STEPS:
+            written.append(f"half_range_codes = {DAC_HALF_RANGE_CODES}".ljust(34) + "# 12 bits of the laser DAC")
         if (section, key) == ("scanner", "slew_rad_per_s") and display.kpps is not None:
             written += _list_half_widths(config)
     text = "\n".join(written) + "\n"
     return text, build_config(path, parse_toml(text.encode(), str(path)))
+
+
+def split_port(port: str) -> tuple[str, str]:
+    """Return transport and address of a port: a serial device, `simulated`, `helios`, or a network DAC's `KIND:HOST`.
+
+    The transport is '' for anything else.
+    """
+    if port.startswith("/"):
+        return "serial", port
+    transport, _, address = port.partition(":")
+    is_network = transport in NETWORK_DACS
+    is_known = transport in (SIMULATED, *DAC_POWER_STEPS) and bool(address) == is_network
+    return transport if is_known else "", address
+
+
+def _list_address(transport: str, address: str) -> list[str]:
+    lines = [f"port = {json.dumps(address)}"] if address else []
+    if transport in DAC_POWER_STEPS:
+        lines.append("interlock_watched = false".ljust(34) + "# true once an external interlock cuts the laser")
+    return lines
 
 
 def _list_half_widths(template: Config) -> list[str]:
@@ -103,12 +126,10 @@ def check_lens(option: str, lens_mm: float, farthest_m: float) -> None:
 
 
 def check_port(option: str, port: str) -> None:
-    """Raise InputError for text that names neither a serial device nor the simulated board."""
-    if port != SIMULATED and not port.startswith("/"):
-        expected = (
-            f"a serial device such as /dev/serial/by-id/..., or {SIMULATED}; how-to/use-a-laser-dac writes others"
-        )
-        raise InputError(option, port, expected)
+    """Raise InputError for text that names neither a serial device, nor a laser DAC, nor the simulated board."""
+    if not split_port(port)[0]:
+        dacs = "helios, ether_dream:ADDRESS or idn:ADDRESS for a laser DAC"
+        raise InputError(option, port, f"a serial device such as /dev/serial/by-id/..., {SIMULATED}, or {dacs}")
 
 
 def _list_values(display: NewDisplay, template: Config) -> dict[tuple[str, str], str]:
@@ -138,7 +159,7 @@ def _list_values(display: NewDisplay, template: Config) -> dict[tuple[str, str],
     if display.kpps is not None:
         rated_hz = 1e3 * display.kpps / POINTS_PER_CIRCLE
         numbers["scanner.bandwidth_hz"] = (rated_hz, f"of galvos rated {display.kpps:g} kpps at 8 deg")
-    texts = {".name": display.name, "board.transport": "simulated" if display.port == SIMULATED else "serial"}
+    texts = {".name": display.name, "board.transport": split_port(display.port)[0]}
     lines = {place: (json.dumps(value), "") for place, value in texts.items()}
     lines |= {place: (f"{value:.6g}", comment) for place, (value, comment) in numbers.items()}
     found = {}

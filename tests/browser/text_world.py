@@ -391,6 +391,7 @@ class World:
         names = ("host_bad_frames", "retransmitted", "naks", "board_bad_frames", "underruns")
         link = dict.fromkeys(names, 0) | {
             "port": "/dev/ttyACM0",
+            "limitation": None,
             "state": self.link,
             "error": None if self.link == "up" else "unplugged",
             "round_trip_ms": 0.4,

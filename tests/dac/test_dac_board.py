@@ -23,7 +23,7 @@ COMMAND_S = 0.005
 """Longest time from a frame of the host to the device's stop: a step of the bench and a transfer under way."""
 LEASE_S = 0.1
 REST_S = {"ether_dream": 0.0, "helios": 0.0, "idn": FORMATS["idn"].host_loss_max_s}
-"""Light after a stop: an IDN device plays what it has, whatever it is told."""
+"""Light after a stop: an IDN device plays what it has, also after its stop."""
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
@@ -37,8 +37,8 @@ def test_the_light_is_the_plan_and_never_more(transport, kind):
     dac_format = FORMATS[transport](40_000)
     whole_s = plan.width_s - (2 + dac_format.settling_points) * dac_format.slowest_point_s
     # An IDN device emits all at its slowest, while its buffer fills, and later 1/1.3.
-    least_j = 0.99 * plan.power_w @ whole_s / (IDN_STRETCH if transport == "idn" else 1.0)
-    assert least_j <= light.power_w @ light.width_s <= plan.energy_j.sum()
+    min_j = 0.99 * plan.power_w @ whole_s / (IDN_STRETCH if transport == "idn" else 1.0)
+    assert min_j <= light.power_w @ light.width_s <= plan.energy_j.sum()
     per_pixel_j = np.bincount(light.pixel, light.power_w * light.width_s, minlength=16)
     assert (per_pixel_j <= np.bincount(plan.pixel, plan.energy_j, minlength=16) + 1e-12).all()
     assert judge_place(light, host.display) <= 0.0

@@ -41,6 +41,7 @@ ELSEWHERE = {
     "optodrive fingers": "tests/system/test_standing_frames.py",
     "optodrive study my-study.toml --out data --participant 07 --hold": "tests/browser/test_study_participant.py",
     "optodrive study my-study.toml --out data --participant 07 --lsl": "tests/system/test_study_streams.py",
+    "optodrive serve --config mine.toml": "tests/system/test_dac_daemon.py",
     "optodrive dac": "tests/dac plays on the DACs' own protocols; no device is here",
     "optodrive home": "a synopsis; tests/system/test_home.py",
     "optodrive doctor --config display.toml": "tests/system/test_stages.py",

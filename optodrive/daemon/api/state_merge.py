@@ -18,6 +18,7 @@ from optodrive.daemon.responses.state import (
 )
 from optodrive.device.config import Config
 from optodrive.device.config_sections import BoardSection
+from optodrive.link.dac.formats.registry import describe_limitation
 from optodrive.link.service.status import ServiceStatus
 from optodrive.link.session.board_view import BoardView
 
@@ -49,12 +50,16 @@ def merge_state(config: Config, pixels: int, status: ServiceStatus | None, plann
 
     config: names display, stages and ports; pixels: their number; status: of the link process
     """
+    limitation = describe_limitation(config.board.transport)
     if status is None:
-        link = LinkReport(port=_name_port(config.board), state="down", error=NO_LINK_PROCESS, **NO_STATS)
+        link = LinkReport(
+            port=_name_port(config.board), limitation=limitation, state="down", error=NO_LINK_PROCESS, **NO_STATS
+        )
         board = BoardView().to_dict()
     else:
         link = LinkReport(
             port=status.port,
+            limitation=limitation,
             state="up" if status.connected else "down",
             error=status.link_error,
             **status.stats,

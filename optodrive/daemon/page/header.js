@@ -49,6 +49,8 @@ export class Header {
       find("lamps").append(item);
       return { item, text: item.lastChild, ...LAMPS[input] };
     });
+    this.lampList = find("lamps");
+    this.limitation = find("limitation");
     this.showUnknown("no data yet");
   }
 
@@ -58,6 +60,10 @@ export class Header {
   }
 
   showState({ board, link, queue }) {
+    // A laser DAC has no inputs: lamps would claim that somebody watches them.
+    this.lampList.hidden = link.limitation !== null;
+    this.limitation.hidden = link.limitation === null;
+    setText(this.limitation, link.limitation ?? "");
     const look = LOOKS[board.state];
     if (link.state !== "up" || !look) {
       this.showUnknown(describeUnknown(link));

@@ -49,7 +49,8 @@ class LinkReport(JsonModel):
     """The link to the board: its error counters, and the likely cause of the last problem.
 
     silence_s: since the board's last message, null without a link; beyond 0.5 s the board's state is unknown
-    port: serial port, USB device or simulated board of the link
+    port: serial port, USB device, laser DAC or simulated board of the link
+    limitation: what a laser DAC cannot promise, in a sentence, null for a board; its inputs are then nobody's
     state: whether the link is up
     error: why the link is down, null while it is up
     round_trip_ms: time of the last exchange with the board, ms, null before one
@@ -63,6 +64,7 @@ class LinkReport(JsonModel):
     """
 
     port: str
+    limitation: str | None
     state: Literal["up", "down"]
     error: str | None
     round_trip_ms: float | None

@@ -17,7 +17,7 @@ UID_DIGITS = 24
 
 
 def build_uid(identity: str) -> str:
-    """Return what a DAC says it is as a board's uid."""
+    """Return the uid of a board that stands for a DAC's identity."""
     return sha256(identity.encode()).hexdigest()[:UID_DIGITS]
 
 

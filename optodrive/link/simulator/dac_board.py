@@ -54,7 +54,7 @@ def build_levels(dac_format: DacFormat, curve: Curve = ()) -> IntArray:
 
 
 class OutputSampler:
-    """What the board's outputs did, sampled at the points of a laser DAC.
+    """Samples of the board's outputs at the points of a laser DAC.
 
     levels: of the DAC by duty; at_us: time up to which points were taken
     """
@@ -83,7 +83,7 @@ class OutputSampler:
             self._edges.append((at_us, 0))
 
     def restart(self, at_us: float) -> None:
-        """Forget what waits, and begin dark at a time with the mirrors where they are."""
+        """Forget the points that wait, and begin dark at a time. The mirrors stay."""
         self.at_us = at_us
         self._moves = [(-np.inf, *self._moves[-1][1:])]
         self._edges = [(-np.inf, 0)]
@@ -94,7 +94,7 @@ class OutputSampler:
         return self._moves[0][1:]
 
     @property
-    def is_at_rest(self) -> bool:
+    def is_idle(self) -> bool:
         """Whether only darkness with resting mirrors waits."""
         return len(self._moves) == len(self._edges) == 1 and not self._edges[0][1]
 
@@ -150,7 +150,7 @@ class DacBoard(BoardCore):
         super().__init__(settings, self._on_event, seed, self._sampler.move_to)
 
     def advance(self, now_us: int) -> None:
-        """Carry out each event due up to now_us, and let the DAC play what the outputs did.
+        """Carry out each event due up to now_us, and send the outputs to the DAC.
 
         Raise LinkError if the DAC is lost.
         """
@@ -207,14 +207,14 @@ class DacBoard(BoardCore):
             fills -= 1
 
     def _stop_dac(self) -> None:
-        """Stop the DAC at once, and drop what waits."""
+        """Stop the DAC at once, and drop the points that wait."""
         self._is_streaming, self._ready_us = False, None
         self._sampler.restart(self.machine.now_us)
         self._dac.stop()
 
     def _feed(self, now_us: int) -> None:
-        """Send what is due, as far as the DAC has room."""
-        if self.state not in (BoardState.RUNNING, BoardState.HOLD) and self._sampler.is_at_rest:
+        """Send the due points, as far as the DAC has room."""
+        if self.state not in (BoardState.RUNNING, BoardState.HOLD) and self._sampler.is_idle:
             # A pause between jobs ends a lag.
             self._sampler.at_us = max(self._sampler.at_us, now_us - self._chunk_points * self._sampler.period_us)
         while now_us >= self._due_us - 1e6 * POLLS_BEFORE_S:
@@ -258,7 +258,7 @@ class DacBoard(BoardCore):
         A job has lost light: FAULT. Without one, the next call starts the DAC again.
         """
         self._events({"t_us": self.machine.now_us, "event": "dac", "error": str(error)})
-        if self.state in (BoardState.RUNNING, BoardState.HOLD) or not self._sampler.is_at_rest:
+        if self.state in (BoardState.RUNNING, BoardState.HOLD) or not self._sampler.is_idle:
             self.machine.fail("UNDERRUN")
         try:
             self._stop_dac()

@@ -1,4 +1,4 @@
-"""Transport to the board of a laser DAC, a process on a pseudo-terminal that plays what the board does on the DAC."""
+"""Transport to the board of a laser DAC, a process on a pseudo-terminal."""
 
 import json
 import tempfile
@@ -34,7 +34,7 @@ class DacBoard:
         )
 
     def open(self) -> None:
-        """Start the board process if necessary and open its port. Raise LinkError with what keeps it from the DAC."""
+        """Start the board process if necessary and open its port. Raise LinkError if there is no DAC."""
         self._process.start(self.name)
         self._port.open()
 
@@ -51,7 +51,7 @@ class DacBoard:
         return self._port.fileno()
 
     def describe_fault(self) -> str:
-        """Return what the board process said last, if it has ended."""
+        """Return the last line of a board process that has failed, or an empty text."""
         return self._process.read_failure()
 
     def close(self) -> None:

@@ -51,6 +51,7 @@ class DacFormat(ABC):
     points_max: maximum number of points of a chunk
     host_loss_max_s: maximum emission after the last byte of a dead host
     lag_max_s: maximum time by which playback ends later than the host expects
+    stops_at_once: whether its stop ends what it has received, or only what follows
     fixed_length: every chunk of a plan has the same number of points
     settling_points: dark points that precede a pulse in addition to the planned dark time
     """
@@ -61,6 +62,7 @@ class DacFormat(ABC):
     points_max: ClassVar[int]
     host_loss_max_s: ClassVar[float]
     lag_max_s: ClassVar[float] = 0.0
+    stops_at_once: ClassVar[bool] = True
     fixed_length: ClassVar[bool] = False
     settling_points: ClassVar[int] = 0
 

@@ -66,6 +66,7 @@ class IdnFormat(DacFormat):
     host_loss_max_s = 0.13
     """The lead, and what a device that plays slower has fallen behind: twice its buffer of 40 ms, 1.3 times slower."""
     lag_max_s = host_loss_max_s
+    stops_at_once = False
     fixed_length = True
     settling_points = 1
 

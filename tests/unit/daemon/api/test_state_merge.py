@@ -86,3 +86,13 @@ def test_a_pause_is_reported_before_the_planner_knows_of_it(ends_in_s):
     assert (running.status, running.ends_in_s) == (("running", 1.0) if ends_in_s is None else ("paused", None))
     assert (waiting.status, waiting.ends_in_s) == ("queued", 1.0)
     assert merge(None, planner).queue.paused is False
+
+
+@pytest.mark.parametrize(("transport", "words"), [("helios", "After the death"), ("idn", "After STOP or the death")])
+def test_a_laser_dac_states_what_it_cannot_promise(transport, words):
+    config = DISPLAYS["display-16"].config
+    assert merge_state(config, 16, None, None).link.limitation is None
+    board = config.board.model_copy(update={"transport": transport, "port": "dac"})
+    limitation = merge_state(config.model_copy(update={"board": board}), 16, None, None).link.limitation
+    assert limitation.startswith("Laser DAC: no interlock, key or emergency stop of its own")
+    assert words in limitation

@@ -19,6 +19,7 @@ BOARD = dict.fromkeys(("inputs", "done_index", "queued", "free_points", "underru
 BOARD |= {"format_errors": 0, "seq_errors": 0, "laser_on_s": 0.0, "temperature_c": None, "uid": "", "firmware": 1}
 LINK = dict.fromkeys(("host_bad_frames", "retransmitted", "naks", "board_bad_frames", "underruns"), 0)
 LINK |= {
+    "limitation": None,
     "round_trip_ms": None,
     "silence_s": None,
     "longest_stall_ms": 0.0,
