@@ -50,13 +50,20 @@ class DeviceProcess:
             try:
                 stopped = []
                 signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
+                marks_s = []
+                signal.signal(signal.SIGUSR1, lambda *_: marks_s.append(time.monotonic()))
                 log = serve(self.address, broadcast_port, lambda: os.write(done, b"."), stopped, **device)
+                log["marks_s"] = np.array(marks_s) - log["zero_s"]
                 np.savez(self.path, **log)
             finally:
                 os._exit(0)
         os.close(done)
         assert os.read(ready, 1), "the device did not start"
         os.close(ready)
+
+    def mark(self):
+        """Note a moment in the device's log, by its own clock, as `marks_s`."""
+        os.kill(self.pid, signal.SIGUSR1)
 
     def finish(self):
         """End the device and return its log."""

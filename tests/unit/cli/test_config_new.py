@@ -213,3 +213,25 @@ def test_a_wrong_answer_is_asked_again_and_costs_none_of_the_others(tmp_path):
     assert (config.display.rows, config.display.columns, config.display.pitch_m) == (6, 7, 3e-3)
     assert (config.laser.max_power_w, config.scanner.focal_length_m) == (1.6, 0.1)
     assert config.board.port == "/dev/ttyACM0"
+
+
+@pytest.mark.parametrize(
+    ("port", "transport", "address"),
+    [("ether_dream:192.168.1.20", "ether_dream", "192.168.1.20"), ("idn:dac", "idn", "dac"), ("helios", "helios", "")],
+)
+def test_a_laser_dac_gets_its_keys_and_no_permission(tmp_path, capsys, port, transport, address):
+    path = tmp_path / "mine.toml"
+    assert write(path, port=port) == 0
+    config = load_config(path)
+    assert (config.board.transport, config.board.port, config.board.interlock_watched) == (transport, address, False)
+    assert config.scanner.half_range_codes == 2047
+    assert run(["config", "check", "--config", str(path)]) == 0
+    capsys.readouterr()
+    assert run(["serve", "--config", str(path)]) == 2
+    assert "true once an external interlock cuts the laser" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("port", ["ether_dream", "helios:1", "idn:", "ftp:dac"])
+def test_a_port_of_no_device_is_refused(tmp_path, capsys, port):
+    assert write(tmp_path / "mine.toml", port=port) == 2
+    assert "helios, ether_dream:ADDRESS or idn:ADDRESS for a laser DAC" in capsys.readouterr().err

@@ -18,7 +18,7 @@ def find_format(transport: str) -> type[DacFormat]:
 
 
 def describe_limitation(transport: str) -> str | None:
-    """Return what a laser DAC cannot promise, None for a board."""
+    """Return the limitation of a laser DAC against a board in one text, None for a board."""
     if transport not in FORMATS:
         return None
     dac_format = FORMATS[transport]
