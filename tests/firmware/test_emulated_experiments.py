@@ -10,6 +10,7 @@ from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.virtual_run import MemoryLink
+from optodrive.planning import heat_record
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from planner_rig import PlannerRig
 
@@ -70,8 +71,9 @@ def test_an_experiment_is_executed_as_planned(monkeypatch, chips, name, given, c
 
 @pytest.mark.slow
 def test_experiment_1_is_executed_by_a_pico_on_its_usb_port(monkeypatch, tmp_path):
-    """The image has its own settings, with which the key must be turned before each arming."""
+    """The image has its own settings, with which the key must be turned before each arming, and its own uid."""
     image = PicoImage(tmp_path)
+    monkeypatch.setattr(heat_record, "LIGHTLESS", heat_record.LIGHTLESS | {b"rp2040-00001".hex()})
 
     def make_pico(settings, sink, seed):
         pico = EmulatedUsbPico(image, settings, sink, seed)
