@@ -79,7 +79,7 @@ def run(
     """
     from optodrive.core.files import check_output
     from optodrive.study.dataset import check_new_participant, check_participant, read_participants, write_dataset
-    from optodrive.study.study_file import SIMULATED_PREFIX, load_study
+    from optodrive.study.study_file import SIMULATED_PREFIX, load_study, name_lines
     from optodrive.study.trial_list import list_trials
 
     design = load_study(source)
@@ -111,13 +111,13 @@ def run(
         list_trials(design, participant, session or 1)  # refuses a code without a number beside a Latin square
     display_config = _load_display_config(design, participant, url, config)
     try:
-        if participant is None:
-            sessions = _simulate(design, out, participants, display_config)
-        else:
-            person = participant, session or 1
-            sessions = {
-                _name_session(design, *person): _run_person(design, out, *person, url, hold, lsl, page, display_config)
-            }
+        with name_lines(source):
+            if participant is None:
+                sessions = _simulate(design, out, participants, display_config)
+            else:
+                person = participant, session or 1
+                records = _run_person(design, out, *person, url, hold, lsl, page, display_config)
+                sessions = {_name_session(design, *person): records}
     except BaseException:  # a session that has not ended has tables, too
         with suppress(InputError):
             if (out / "sourcedata").is_dir():

@@ -65,7 +65,7 @@ def power(
     from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel
     from optodrive.study.power import compute_powers, measure_effect, simulate_sessions
-    from optodrive.study.study_file import load_study
+    from optodrive.study.study_file import load_study, name_lines
     from optodrive.study.trial_stimulus import check_stimuli
 
     design, numbers = load_study(source), _parse_numbers(participants)
@@ -79,7 +79,8 @@ def power(
     if not 0.0 <= spread <= 3.0:
         raise InputError("--spread", spread, "0 to 3")
     display_config = load_config(config)
-    check_stimuli(design, display_config)
+    with name_lines(source):
+        check_stimuli(design, display_config)
     measure_effect(design, [], compare, reference, spread)  # refuses what the design has not, before it simulates
     announce_compilation()
     with show_progress("simulating") as on_progress:

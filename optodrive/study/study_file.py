@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -385,12 +386,15 @@ def list_shipped_studies() -> list[str]:
     return sorted(path.stem for path in EXPERIMENTS.glob("*.toml"))
 
 
+def _find_path(source: str) -> Path:
+    return EXPERIMENTS / f"{source}.toml" if source in list_shipped_studies() else Path(source)
+
+
 def load_study(source: str) -> Study:
     """Read a study file with its frames, or a shipped one by its name. Raise InputError with one line."""
-    names = list_shipped_studies()
-    path = EXPERIMENTS / f"{source}.toml" if source in names else Path(source)
+    path = _find_path(source)
     if not path.is_file():
-        raise InputError("study", source, "a file, or " + ", ".join(names))
+        raise InputError("study", source, "a file, or " + ", ".join(list_shipped_studies()))
     table = read_toml(path)
     try:
         check_format(path, table, FORMAT, VERSION)
@@ -431,6 +435,32 @@ def _find_line(path: Path, place: str) -> int | None:
         if depth > best:
             found, best = number, depth
     return found
+
+
+@contextmanager
+def name_lines(source: str) -> Iterator[None]:
+    """Add the line of a study file to the error about a stimulus that a display has not, where one line states it."""
+    try:
+        yield
+    except InputError as error:
+        path = _find_path(source)
+        line = _find_parameter(path, error) if error.where.startswith("study ") else None
+        if line is None:
+            raise
+        raise InputError(f"{path}, line {line}: {error.where}", error.value, error.expected, error.code) from None
+
+
+def _find_parameter(path: Path, error: InputError) -> int | None:
+    """Return the line with the name of a refused parameter, and with its value if one has both."""
+    last, shown = error.where.split(" ")[-1], f"{error.value:g}" if isinstance(error.value, float) else str(error.value)
+    lines = list(enumerate(path.read_text("utf-8-sig").splitlines(), start=1))
+    for name in (last, last.rpartition(".")[2], str(error.value)):
+        named = [
+            (number, text) for number, text in lines if re.search(rf"""(?<![\w.]){re.escape(name)}["']?\s*=""", text)
+        ]
+        if named:
+            return next((number for number, text in named if shown in text), named[0][0])
+    return None
 
 
 def _split_key(text: str) -> list[str]:

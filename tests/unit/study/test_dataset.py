@@ -55,7 +55,10 @@ def test_a_stimulus_that_the_display_has_not_is_refused_before_the_first_one(tmp
     assert old in text
     path.write_text(text.replace(old, new, 1))
     assert run(["study", str(path), "--out", str(tmp_path / "dataset")]) == 2
-    assert expected in capsys.readouterr().err
+    line = next(k for k, text in enumerate(path.read_text().splitlines(), start=1) if new.splitlines()[-1] in text)
+    error = capsys.readouterr().err
+    assert expected in error
+    assert f"{path}, line {line}: study experiment-2: " in error
     assert not list(tmp_path.glob("dataset/sourcedata/*"))
 
 
