@@ -56,9 +56,11 @@ console.log(JSON.stringify({
 """
 
 
-@pytest.fixture(scope="module")
-def embedded(tmp_path_factory):
-    daemon = Daemon(tmp_path_factory.mktemp("embedded"), None, name="display-16")
+@pytest.fixture
+def embedded(tmp_path):
+    folder = tmp_path / "daemon"
+    folder.mkdir()
+    daemon = Daemon(folder, None, name="display-16")
     yield daemon
     daemon.stop()
 
@@ -125,6 +127,7 @@ def test_a_generated_typescript_client_plays_and_reads(embedded, tmp_path):
         node = [shutil.which("node"), tmp_path / "node_modules" / command[0], *command[1:]]
         done = subprocess.run(node, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
+    wait_for(lambda: embedded.board_state() == "DISARMED", "the link to the board")
     run = [shutil.which("node"), "client.js", embedded.url, TOKEN]
     done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
