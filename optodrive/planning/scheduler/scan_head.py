@@ -115,6 +115,6 @@ class BeamPath:
     def compute_order(self, active: IntArray, origin: int | None) -> list[int]:
         """Return a short visiting order of the pixels `active` [k], starting from `origin` if it is known."""
         layout = self._layout
-        order = compute_visiting_order(active, layout.row, layout.column, self.x_rad, self.y_rad, origin)
+        order = compute_visiting_order(active, layout.row, layout.column, self.x_rad, self.y_rad, origin, True)
         visits: list[int] = order.tolist()
         return visits

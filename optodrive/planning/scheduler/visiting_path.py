@@ -9,10 +9,12 @@ This is a travelling-salesman path of up to 1,511 pixels, needed anew for each s
 
 Why this way. A full lattice has a path of single steps, row by row or column by column, and nothing is shorter. So the
 shorter of both serpentines, or of their reverses, is taken first, and kept if it is within `GOOD_ENOUGH_RATIO` of as
-many of its shortest steps. Only sparse frames (letters, outlines, random dots) are improved: by reversing segments
-(2-opt, Croes 1958) and by moving segments of up to `MAX_SEGMENT` pixels, either way round (Or-opt, Or 1976), until
-neither shortens the path. Only changes that put a pixel next to one of its `NEIGHBOUR_COUNT` nearest are tried, and
-only around pixels whose neighbourhood has changed (`pending`), which makes a pass linear in the number of pixels.
+many of its shortest steps. A serpentine moves one mirror only, whose coil reaches its cap in a frame of `LONG_FRAME`
+pixels or more: such a frame takes a spiral, which moves both mirrors alike, where it is as short. Only sparse frames
+(letters, outlines, random dots) are improved: by reversing segments (2-opt, Croes 1958) and by moving segments of up to
+`MAX_SEGMENT` pixels, either way round (Or-opt, Or 1976), until neither shortens the path. Only changes that put a pixel
+next to one of its `NEIGHBOUR_COUNT` nearest are tried, and only around pixels whose neighbourhood has changed
+(`pending`), which makes a pass linear in the number of pixels.
 
 Invariants. `tour` stays a permutation of the active pixels, and `place[tour[k]] == k`. Every accepted change shortens
 the path by more than `min_gain_rad`, so that rounding cannot keep it from ending. A missing neighbour (before an
@@ -34,6 +36,10 @@ GOOD_ENOUGH_RATIO = 1.02
 """A path within this ratio of a path of its own shortest steps alone is not improved."""
 MAX_SEGMENT = 3
 """Largest number of pixels in a moved segment."""
+LONG_FRAME = 700
+"""Number of pixels from which a path that moves both mirrors alike is preferred."""
+SPIRAL_RATIO = 1.005
+"""Largest ratio of such a path to the shortest serpentine."""
 
 
 def compute_serpentine_order(active: IntArray, row: IntArray, column: IntArray) -> IntArray:
@@ -47,12 +53,33 @@ def compute_serpentine_order(active: IntArray, row: IntArray, column: IntArray) 
     return active[np.lexsort((direction, rows))]
 
 
+def compute_spiral_order(active: IntArray, row: IntArray, column: IntArray) -> IntArray:
+    """Order pixels ring by ring from the outermost one inwards, so that both mirrors move alike.
+
+    active: [k] pixels; row, column: [p] positions on the lattice
+    """
+    down, right = row[active] - row[active].min(), column[active] - column[active].min()
+    ring = np.min([down, right, down.max() - down, right.max() - right], axis=0)
+    width, height = right.max() - 2 * ring, down.max() - 2 * ring
+    down, right = down - ring, right - ring
+    sides = [down == 0, right == width, down == height]
+    along = np.select(sides, [right, width + down, 2 * width + height - right], 2 * (width + height) - down)
+    return active[np.lexsort((along, ring))]
+
+
 def compute_visiting_order(
-    active: IntArray, row: IntArray, column: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int | None = None
+    active: IntArray,
+    row: IntArray,
+    column: IntArray,
+    x_rad: FloatArray,
+    y_rad: FloatArray,
+    origin: int | None = None,
+    spares_coils: bool = False,
 ) -> IntArray:
     """Return a short path over the pixels `active` [k], starting from the pixel `origin` if it is known.
 
     row, column, x_rad, y_rad: [p] positions on the lattice, and mirror angles
+    spares_coils: a long frame moves both mirrors alike
     """
     if len(active) < 3:
         return active
@@ -62,6 +89,13 @@ def compute_visiting_order(
     tours += [tour[::-1] for tour in tours]
     lengths_rad = [path_rad(tour, x_rad, y_rad, begin) for tour in tours]
     best = int(np.argmin(lengths_rad))
+    if spares_coils and len(active) >= LONG_FRAME:
+        spiral = compute_spiral_order(active, row, column)
+        for tour in (spiral, spiral[::-1]):
+            tours.append(tour)
+            lengths_rad.append(path_rad(tour, x_rad, y_rad, begin))
+        shorter = 4 + int(np.argmin(lengths_rad[4:]))
+        best = shorter if lengths_rad[shorter] <= SPIRAL_RATIO * lengths_rad[best] else best
     tour = np.ascontiguousarray(tours[best], dtype=np.int64)
     steps_rad = np.maximum(np.abs(np.diff(x_rad[tour])), np.abs(np.diff(y_rad[tour])))
     # Full lattices stop here: no path is shorter than as many of the shortest steps.

@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 
+from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine.plan_making import dim_display
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.scheduler import visiting_path
 from optodrive.planning.scheduler.scheduler import GalvoPause, Scheduler
 
 
@@ -60,13 +62,22 @@ def test_widths_at_full_power_are_whole_microseconds_where_the_gate_allows_it(di
     assert np.allclose(dimmed.width_s / 2e-4, np.round(dimmed.width_s / 2e-4), atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["display-437", "display-1511"])
 @pytest.mark.parametrize(("height_um", "rate_min_hz"), [(50.0, 328.0), (20.0, 690.0)])
-def test_gates_in_microseconds_draw_a_full_frame_faster(display, height_um, rate_min_hz):
-    fine = build_fine(display)
-    planned = plan_frames(fine, frame(fine, dict.fromkeys(range(437), height_um), duration=10.0))
+def test_gates_in_microseconds_draw_a_full_frame_faster(name, height_um, rate_min_hz):
+    display = DISPLAYS[name]
+    fine, heights_um = build_fine(display), dict.fromkeys(range(len(display.layout)), height_um)
+    planned = plan_frames(fine, frame(fine, heights_um, duration=10.0))
     assert len(planned.plan) / planned.duration_s >= rate_min_hz
-    of_whole = plan_frames(display, frame(display, dict.fromkeys(range(437), height_um), duration=10.0))
+    of_whole = plan_frames(display, frame(display, heights_um, duration=10.0))
     assert planned.duration_s < 0.96 * of_whole.duration_s
+
+
+def test_a_long_frame_along_one_mirror_waits_for_its_coil(monkeypatch):
+    """Mutant: a full frame is always a serpentine."""
+    monkeypatch.setattr(visiting_path, "LONG_FRAME", 10_000)
+    with pytest.raises(AssertionError):
+        test_gates_in_microseconds_draw_a_full_frame_faster("display-1511", 20.0, 690.0)
 
 
 def test_a_train_keeps_its_times_and_a_frame_fills_the_gaps(display):
