@@ -1,3 +1,6 @@
+from functools import reduce
+from operator import add
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,4 +16,4 @@ def test_it_counts_values_at_most_each_bound(values):
         histogram.add(value)
     counts = [sum(value <= bound for value in values) for bound in BOUNDS]
     assert histogram.cumulative_counts() == [*counts, len(values)]
-    assert histogram.sum == sum(values)
+    assert histogram.sum == reduce(add, values, 0.0)
