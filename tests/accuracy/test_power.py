@@ -156,7 +156,8 @@ def test_thresholds_of_a_design_with_levels_have_the_power_of_other_code(capsys,
     assert expected[40] - expected[4] > 0.4
 
 
-@pytest.mark.parametrize("seeds", [600, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [600, 5000])
 def test_shares_of_a_design_with_levels_have_the_power_of_a_mixed_model(capsys, seeds):
     words = ["gap-detection", "--participants", "4..40", "--spread", str(SPREAD), "--seeds", str(seeds)]
     _, powers = estimate(capsys, *words, "--compare", "gap_ms", "--reference", "0.32")
