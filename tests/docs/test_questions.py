@@ -57,7 +57,7 @@ QUESTIONS = {
         "How do I write frames?": ("reference/formats/frames-json.md", "target_um"),
         "How do I make an animation live?": ("how-to/stream-frames.md", "/v1/stream"),
         "How do I preview it?": ("how-to/operate-the-page.md", "Preview"),
-        "How do I add a pattern of my own?": ("how-to/add-a-pattern.md", "entry"),
+        "How do I add a pattern of my own?": ("how-to/add-patterns-and-terms.md", "entry"),
     },
     "Reader of braille": {
         "Which screen readers work?": ("how-to/read-with-a-screen-reader.md", "NVDA"),

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -76,6 +77,7 @@ def generated(tmp_path_factory):
         ],
         capture_output=True,
         text=True,
+        env={**os.environ, "PATH": f"{sys.prefix}/bin:{os.environ['PATH']}"},  # it formats with ruff
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert "arning" not in done.stdout, done.stdout  # about a part of the document that it leaves out
