@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from heat_world import DISPLAY, NOBODY, UIDS, new_world
 from optodrive.daemon.engine import kept_heat
-from optodrive.lab.commissioning import exclusive_board
 from optodrive.planning import heat_record
 from optodrive.planning.heat_record import HeatRecord
 
@@ -104,7 +103,7 @@ def test_a_run_that_records_nothing_at_its_end_is_caught(monkeypatch):
 
 
 def _accept_all_boards(patch):
-    for module in (heat_record, kept_heat, exclusive_board):
+    for module in (heat_record, kept_heat):
         patch.setattr(module, "join_uids", lambda uids, is_part=False: "any")
     enter = HeatRecord.open
 
