@@ -2,6 +2,7 @@
 
 import gc
 import os
+import platform
 import signal
 import tempfile
 from pathlib import Path
@@ -12,6 +13,8 @@ from hypothesis import HealthCheck, settings
 
 # Before numpy is imported, also for the workers of xdist: a second thread of BLAS takes the time of the other worker.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if platform.machine() == "x86_64":  # one kernel for all processors: others round sums in another order
+    os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
 import forked_probe
 import forked_process
