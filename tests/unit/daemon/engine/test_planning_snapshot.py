@@ -13,6 +13,9 @@ from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 
 DISPLAY = DISPLAYS["display-1511"]
+DISPLAY = replace(
+    DISPLAY, budget=DISPLAY.budget._replace(caps=DISPLAY.budget.caps._replace(galvo_rad2_per_s4=6e4**2))
+)  # at the shipped cap the mirrors need no pause
 SCALES = build_scales(DISPLAY.config)
 START_S = 7.0
 
