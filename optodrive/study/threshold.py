@@ -38,7 +38,7 @@ MARGIN = 4.0
 """Factor by which the grid of thresholds goes beyond the levels."""
 SLOPE_RANGE = (1.5, 6.0)
 DIFFERENCE_SLOPES = (0.75, 3.0)
-"""Slopes over a difference of two intervals: 1.25 times the exponent of d', some 0.6 to 2.4 (Strasburger 2001)."""
+"""Slopes over a difference of two intervals: 1.25 times the exponent of d', assumed to be 0.6 to 2.4."""
 LAPSE_RANGE = (0.0, 0.05)
 """Lapses of a participant who attends."""
 LAPSES = ((0.0, 0.31), (0.025, 0.31), (0.05, 0.31), (0.1, 0.04), (0.2, 0.02), (0.35, 0.01))
